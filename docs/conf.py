@@ -62,6 +62,7 @@ sphinx_gallery_conf = {
     "show_signature": False,
     "remove_config_comments": True,
     "write_computation_times": False,
+    "thumbnail_size": (420, 280),
     "image_scrapers": ("tools.site_gallery.scrape_figures",),
     "ignore_repr_types": r"matplotlib|NotebookFigure",
 }

@@ -95,10 +95,10 @@ def rewrite_docstring(
 
 def list_entries(text: str) -> list[str]:
     """Return the pages that a text links in the lines of its lists, and in those of its tables in
-    the first cell with a link; each once.
+    the first cell with a link; each once. Lines with pictures lead to pages that are listed, too.
     """
     pages = []
-    for line in LINE.findall(text):
+    for line in (line for line in LINE.findall(text) if "![" not in line):
         cells = (LINK.findall(cell) for cell in line.split("|"))
         pages += next((links for links in cells if links), [])
     return list(dict.fromkeys(pages))

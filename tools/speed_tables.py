@@ -19,8 +19,8 @@ ENGINES = {"numpy": "NumPy engine", "native": "native engine"}
 
 BY_HAND = {
     "forward_of_fsolve": "forward kinematics of 1,000 poses, against a loop over scipy's `fsolve`",
-    "one_fit": "one fit with all its results, against scipy's `least_squares` with a Jacobian "
-    "written by hand",
+    "one_fit": "one fit with intervals, rank and checks, against scipy's `least_squares` alone "
+    "with a Jacobian written by hand",
 }
 """Works that README compares with programs of users."""
 

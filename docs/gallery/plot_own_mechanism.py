@@ -8,6 +8,8 @@ has a model of it. Its description takes thirty lines: chains of joints and how 
 this loopcal derives kinematics, parameters and calibration, without a line of code.
 """
 
+# sphinx_gallery_thumbnail_path = "docs/pictures/thumbnails/own_mechanism.png"
+
 # %%
 # Two slides run along x at y = 0 and y = 300 mm. Each pushes a rod, and both rods meet in the
 # pen. ``errors`` and ``unknown`` name what may differ from the drawing: where each slide is, how

@@ -8,6 +8,8 @@ Both calibrations differ in all 42 numbers, because both have noise. Comparing t
 the machine itself has changed, and where.
 """
 
+# sphinx_gallery_thumbnail_path = "docs/pictures/thumbnails/two_sessions.png"
+
 # %%
 # Both sessions use a six-degree-of-freedom tracker: 5 um and 20 urad.
 

@@ -205,7 +205,7 @@ def test_view_opens_without_requests_and_errors_and_turns_by_keys(browser, page)
     assert tab.evaluate(frames) == 0  # nothing moves by itself
     tab.keyboard.press("Home")
     assert wait_for_change(figure, turned) == first
-    figure.locator("select").select_option(label="4")
+    figure.get_by_label("Robot at pose").select_option(label="4")
     place = "x [-0-9.]+, y [-0-9.]+, z [-0-9.]+ mm"
     text = rf"Pose 4: tool at {place}; error before calibration [0-9.]+ mm\."
     assert re.fullmatch(text, said.inner_text())
@@ -228,6 +228,29 @@ def wait_for_change(figure: Any, before: str) -> str:
             return after
         figure.page.wait_for_timeout(20)
     raise AssertionError("the view was not drawn again")
+
+
+def test_sliders_change_errors_and_the_second_robot(browser, page) -> None:
+    tab, logged = browser.new_page(), []
+    tab.on("pageerror", lambda error: logged.append(str(error)))
+    tab.goto(page.as_uri())
+    figure = open_view(tab)
+    errors, motion = (figure.locator("input[type=range]").nth(k) for k in (0, 1))
+    assert figure.get_by_text("x 200", exact=True).is_visible()
+    errors.fill("1")
+    assert figure.get_by_text("x 2000", exact=True).is_visible()
+    play = figure.get_by_text("play", exact=True)
+    assert not motion.is_visible()
+    figure.get_by_label("Second robot").select_option("before calibration")
+    assert motion.is_visible()
+    assert figure.get_by_text("The second robot is the geometry before").is_visible()
+    play.click()
+    tab.wait_for_function("i => Number(i.value) < 0.9", arg=motion.element_handle())
+    figure.get_by_text("stop", exact=True).click()
+    still = motion.input_value()
+    tab.wait_for_timeout(200)
+    assert motion.input_value() == still
+    assert logged == []
 
 
 def test_picture_stays_where_a_browser_has_no_webgl(program, page) -> None:

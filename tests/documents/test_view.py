@@ -3,12 +3,14 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import re
 import webbrowser
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import loopcal as lc
@@ -51,9 +53,36 @@ def test_view_of_a_run_has_its_poses_errors_and_map(
     assert len(scene["map"]["colors"]) == 200
     meanings = " ".join(row["text"] for row in scene["legend"])
     assert re.search(r"before calibration, [0-9]+ times magnified", meanings)
-    assert re.search(r"over the workspace, [0-9.]+ to [0-9.]+ mm", meanings)
+    assert re.search(r"over the workspace, [0-9.]+ to [0-9.]+ um", meanings)
+    assert len(scene["map"]["hull"]) % 3 == 0
+    assert max(scene["map"]["hull"]) < len(scene["map"]["colors"])
+    assert re.fullmatch(r"largest: [0-9.]+ um", scene["map"]["largest"]["text"])
+    assert [motion["name"] for motion in scene["motions"]] == ["before calibration"]
     again = lc.save_view(calibration, "again.html")
     assert read_scene(again) == scene
+
+
+def test_view_shows_what_undetermined_combinations_do(tmp_path, monkeypatch, capsys) -> None:
+    """Positions of the tool do not tell how the platform frame is turned about it."""
+    monkeypatch.chdir(tmp_path)
+    simulate = "simulate hexapod-42 --draw-errors --kind component --components x,y,z -o m.csv"
+    assert main(simulate.split()) == 0
+    assert main(["calibrate", "hexapod-42", "m.csv", "-o", "run", "--method", "least-squares"]) == 0
+    assert main(["view", "run", "--no-browser"]) == 0
+    capsys.readouterr()
+    scene = read_scene(Path("view.html"))
+    before, *combinations = scene["motions"]
+    assert before["name"] == "before calibration"
+    assert len(combinations) == 3
+    robot, tool = lc.load_run("run").robot, [part["role"] for part in scene["parts"]].index("tool")
+    first = sum(part["count"] for part in scene["parts"][:tool])
+    for motion in combinations:
+        assert motion["name"].startswith("not determined: leg")
+        assert "platform frame about" in motion["text"]
+        shift = np.frombuffer(base64.b64decode(motion["shift"]), "<f4").reshape(-1, 3)
+        lengths = np.linalg.norm(shift, axis=1) * 1e-3 / robot.size
+        assert 0.05 < lengths.max() <= 0.15 + 1e-6
+        assert lengths[first] < 1e-4  # what was measured stays
 
 
 def test_view_of_a_fit_that_did_not_converge_shows_the_robot_before(run) -> None:

@@ -14,7 +14,7 @@ from docutils.core import publish_string
 
 import loopcal
 from loopcal.cli.entry_point import command_line
-from tools import check_site, site_commands, site_docstrings, site_pages
+from tools import check_site, site_commands, site_docstrings, site_pages, thumbnails
 from tools.api_reference import SECTIONS
 
 INDEX = """\
@@ -22,6 +22,7 @@ INDEX = """\
 
 | page | content |
 |---|---|
+| [![six](six.png)](six.md) | |
 | [one](one.md), [two](two.md) | see also [three](three.md) |
 | - | [four](four.md) |
 
@@ -52,6 +53,18 @@ def test_links_of_an_index_become_its_contents_in_their_order() -> None:
         [":hidden:", ":caption:", "Questions", "questions/README.md"],
         [":hidden:", ":caption:", "Gallery", "generated/gallery/index.rst"],
     ]
+
+
+def test_each_example_has_its_thumbnail_and_no_other_exists(root) -> None:
+    """`python -m tools.thumbnails` draws them."""
+    folder = root / "docs" / "pictures" / "thumbnails"
+    names = {path.stem.removeprefix("plot_") for path in (root / "docs/gallery").glob("plot_*.py")}
+    assert {path.stem for path in folder.glob("*.png")} == names
+    assert {name.removeprefix("plot_") for name in thumbnails.DRAWINGS} == names
+    for name in names:
+        text = (root / "docs" / "gallery" / f"plot_{name}.py").read_text("utf-8")
+        path = f"docs/pictures/thumbnails/{name}.png"
+        assert f'# sphinx_gallery_thumbnail_path = "{path}"' in text
 
 
 def test_page_that_is_no_index_stays_as_it_is() -> None:

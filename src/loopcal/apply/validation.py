@@ -56,6 +56,7 @@ from loopcal.numerics.statistics import compute_f_quantile, find_distinct
 from loopcal.results.description import Field, fields
 from loopcal.results.result import DrawnResult
 from loopcal.results.storage import restore
+from loopcal.results.tables import choose_unit
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import SI_SYMBOLS, Unit
 
@@ -289,13 +290,12 @@ class Validation(DrawnResult):
         """Return one line for each quantity: its rms before and after, and the noise floor."""
         lines = []
         for quantity, change in self.changes().items():
-            unit = self.units.get(quantity)
-            factor, symbol = (1.0, "sigma") if unit is None else (unit.factor_to_si, unit.symbol)
-            name = "all kinds" if unit is None else quantity
-            before, after, floor = (
-                f"{round_to_digits(value / factor)} {symbol}"
-                for value in (change.before, change.after, change.noise_floor)
-            )
+            values = (change.before, change.after, change.noise_floor)
+            name, factor, symbol = "all kinds", 1.0, "sigma"
+            if (unit := self.units.get(quantity)) is not None:
+                unit = choose_unit(unit, values[1:])  # errors before may be far larger
+                name, factor, symbol = quantity, unit.factor_to_si, unit.symbol
+            before, after, floor = (f"{round_to_digits(v / factor)} {symbol}" for v in values)
             lines.append(
                 f"  {name} (rms): {before} before, {after} after calibration (noise floor {floor})"
             )

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 // The scene that a page contains as JSON; arrays of numbers are base64 of 32-bit floats.
-// src/loopcal/report/scene/scene_data.py writes it and states what each entry means.
+// src/loopcal/report/scene/scene.py writes it and states what each entry means.
 
 /** Return the numbers of an entry. */
 function decode(text) {
@@ -14,6 +14,7 @@ export function readScene(element) {
   scene.home = decode(scene.home);
   for (const key of ["robots", "tools", "errors"]) scene.poses[key] = decode(scene.poses[key]);
   if (scene.map) scene.map.points = decode(scene.map.points);
+  for (const motion of scene.motions) motion.shift = decode(motion.shift);
   return scene;
 }
 
@@ -44,6 +45,9 @@ export function findBounds(scene) {
   for (let i = 0; i < tools.length / 3; i++) {
     include(pointOf(tools, i));
     include(addScaled(pointOf(tools, i), pointOf(errors, i), magnification));
+  }
+  for (const { shift } of scene.motions.slice(0, 1)) {
+    for (let i = 0; i < shift.length / 3; i++) include(addScaled(pointOf(scene.home, i), pointOf(shift, i), 1));
   }
   for (let i = 0; scene.map && i < scene.map.colors.length; i++) include(pointOf(scene.map.points, i));
   return { points, low, high };

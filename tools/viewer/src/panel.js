@@ -9,13 +9,23 @@ export function make(tag, attributes = {}, ...children) {
   return element;
 }
 
-/** Return a list of poses, the robot at home first; `listener` gets the index, -1 for home. */
-export function makeChoice(labels, listener) {
+/** Return a list to choose from; `listener` gets the index, -1 for the first entry. */
+export function makeChoice(text, first, labels, listener) {
   const select = make("select");
-  select.append(make("option", { value: "-1" }, "home"));
+  select.append(make("option", { value: "-1" }, first));
   labels.forEach((label, i) => select.append(make("option", { value: String(i) }, label)));
   select.addEventListener("change", () => listener(Number(select.value)));
-  return { select, field: make("label", {}, "Robot at pose ", select) };
+  return { select, field: make("label", {}, `${text} `, select) };
+}
+
+/** Return a slider from low to high; `listener` gets its value, and returns what to write beside it. */
+export function makeSlider(text, low, high, start, listener) {
+  const input = make("input", { type: "range", min: low, max: high, step: "any", value: start });
+  const beside = make("span");
+  const answer = () => (beside.textContent = listener(Number(input.value)));
+  input.addEventListener("input", answer);
+  const field = make("label", {}, `${text} `, input, " ", beside);
+  return { input, field, answer };
 }
 
 /** Return a box to tick that shows and hides shapes. */

@@ -4,15 +4,17 @@
 import {
   BufferGeometry, BoxGeometry, Color, ConeGeometry, CylinderGeometry, DoubleSide,
   Float32BufferAttribute, InstancedMesh, LineBasicMaterial, LineDashedMaterial, LineSegments,
-  Matrix4, Mesh, MeshBasicMaterial, MeshLambertMaterial, Quaternion, SphereGeometry, Vector3,
+  Matrix4, Mesh, MeshBasicMaterial, MeshPhongMaterial, Quaternion, SphereGeometry, Vector3,
 } from "three";
 
 const UP = new Vector3(0, 1, 0);
 
 /** Return an instanced mesh with these colors, whose instances have no place yet. */
-function makeInstances(geometry, colors, isShaded) {
-  const Material = isShaded ? MeshLambertMaterial : MeshBasicMaterial;
-  const mesh = new InstancedMesh(geometry, new Material(), colors.length);
+function makeInstances(geometry, colors, isShaded, opacity = 1) {
+  const look = { opacity, transparent: opacity < 1 };
+  const material = isShaded ? new MeshPhongMaterial({ ...look, specular: "#333333", shininess: 40 }) : new MeshBasicMaterial(look);
+  const mesh = new InstancedMesh(geometry, material, colors.length);
+  mesh.castShadow = isShaded && opacity === 1;
   colors.forEach((color, i) => mesh.setColorAt(i, new Color(color)));
   mesh.frustumCulled = false;
   return mesh;
@@ -30,8 +32,8 @@ function placeAlong(a, b, radius) {
 
 /** Tubes of one radius each between pairs of points. */
 export class Tubes {
-  constructor(colors, radii) {
-    this.mesh = makeInstances(new CylinderGeometry(1, 1, 1, 12), colors, true);
+  constructor(colors, radii, opacity = 1) {
+    this.mesh = makeInstances(new CylinderGeometry(1, 1, 1, 24), colors, true, opacity);
     this.radii = radii;
   }
 
@@ -44,9 +46,9 @@ export class Tubes {
 
 /** Spheres or boxes at points. */
 export class Points {
-  constructor(colors, radii, isBox = false, isShaded = true) {
-    const geometry = isBox ? new BoxGeometry(2, 2, 2) : new SphereGeometry(1, 16, 12);
-    this.mesh = makeInstances(geometry, colors, isShaded);
+  constructor(colors, radii, isBox = false, isShaded = true, opacity = 1) {
+    const geometry = isBox ? new BoxGeometry(2, 2, 2) : new SphereGeometry(1, 24, 16);
+    this.mesh = makeInstances(geometry, colors, isShaded, opacity);
     this.radii = radii;
   }
 
@@ -75,6 +77,7 @@ export class Arrows {
     const neck = b.map((value, k) => value - share * (value - a[k]));
     this.shafts.setMatrixAt(i, placeAlong(a, neck, this.radius));
     this.heads.setMatrixAt(i, placeAlong(neck, b, 0.36 * head));
+    this.meshes.forEach((mesh) => (mesh.instanceMatrix.needsUpdate = true));
   }
 
   /** Return the meshes. */
@@ -102,17 +105,56 @@ export function moveLines(lines, points) {
   if (lines.material.isLineDashedMaterial) lines.computeLineDistances();
 }
 
-/** Return a translucent surface of triangles from the first of n points to the others. */
-export function makeFan(count, color) {
-  const geometry = new BufferGeometry();
-  geometry.setAttribute("position", new Float32BufferAttribute(new Float32Array(3 * count), 3));
-  const corners = [];
-  for (let i = 1; i + 1 < count; i++) corners.push(0, i, i + 1);
-  geometry.setIndex(corners);
+/** A translucent plate with n corners; unless it may be bent, it vanishes where they are in no plane. */
+export class Slab {
+  constructor(count, thickness, { color, opacity, hasShadow, isBent = false }) {
+    this.thickness = thickness;
+    this.isBent = isBent;
+    const corners = [];
+    for (let i = 1; i + 1 < count; i++) corners.push(0, i, i + 1, count, count + i + 1, count + i);
+    for (let i = 0; i < count; i++) {
+      const next = (i + 1) % count;
+      corners.push(i, count + i, next, next, count + i, count + next);
+    }
+    const geometry = new BufferGeometry();
+    geometry.setAttribute("position", new Float32BufferAttribute(new Float32Array(6 * count), 3));
+    geometry.setIndex(corners);
+    const material = new MeshPhongMaterial({
+      color, opacity, specular: "#222222", transparent: true, side: DoubleSide, depthWrite: false, flatShading: true,
+    });
+    this.mesh = new Mesh(geometry, material);
+    this.mesh.frustumCulled = false;
+    this.mesh.castShadow = hasShadow;
+  }
+
+  /** Place the plate between corners (flat array). */
+  place(corners) {
+    const count = corners.length / 3;
+    const points = Array.from({ length: count }, (_, i) => new Vector3().fromArray(corners, 3 * i));
+    const normal = new Vector3(); // the sum of all triangles, after Newell
+    points.forEach((point, i) => normal.add(point.clone().cross(points[(i + 1) % count])));
+    const size = Math.sqrt(normal.length());
+    normal.normalize();
+    const heights = points.map((point) => point.clone().sub(points[0]).dot(normal));
+    this.mesh.visible = this.isBent || Math.max(...heights) - Math.min(...heights) < 0.02 * size;
+    const places = this.mesh.geometry.attributes.position;
+    points.forEach((point, i) => {
+      for (const side of [0, 1]) {
+        const { x, y, z } = point.clone().addScaledVector(normal, (side - 0.5) * this.thickness);
+        places.setXYZ(i + side * count, x, y, z);
+      }
+    });
+    places.needsUpdate = true;
+  }
+}
+
+/** Return a translucent solid of triangles (flat list of indices) between points with these colors. */
+export function makeSolid(points, triangles, colors) {
+  const geometry = new BufferGeometry().setAttribute("position", new Float32BufferAttribute(points, 3));
+  geometry.setAttribute("color", new Float32BufferAttribute(colors.flatMap((color) => new Color(color).toArray()), 3));
+  geometry.setIndex(triangles);
   const material = new MeshBasicMaterial({
-    color, transparent: true, opacity: 0.18, side: DoubleSide, depthWrite: false,
+    vertexColors: true, transparent: true, opacity: 0.7, side: DoubleSide, depthWrite: false,
   });
-  const mesh = new Mesh(geometry, material);
-  mesh.frustumCulled = false;
-  return mesh;
+  return new Mesh(geometry, material);
 }

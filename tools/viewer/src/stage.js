@@ -2,8 +2,8 @@
 // The canvas of a scene: camera, light, mouse, touch and keyboard. It draws only after a change.
 
 import {
-  Color, DirectionalLight, HemisphereLight, PerspectiveCamera, Scene, Spherical, Vector3,
-  WebGLRenderer,
+  Color, DirectionalLight, HemisphereLight, Mesh, PerspectiveCamera, PlaneGeometry, Scene,
+  ShadowMaterial, Spherical, Vector3, WebGLRenderer,
 } from "three";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 
@@ -27,26 +27,48 @@ export class Stage {
     if (!context) throw new Error("no WebGL");
     this.canvas = canvas;
     this.points = bounds.points;
+    this.low = bounds.floor;
     this.middle = new Vector3().fromArray(bounds.low).add(new Vector3().fromArray(bounds.high)).divideScalar(2);
     this.radius = Math.max(this.middle.distanceTo(new Vector3().fromArray(bounds.high)), 1e-9);
     this.renderer = new WebGLRenderer({ canvas, context });
     this.renderer.setPixelRatio(Math.min(2, window.devicePixelRatio || 1));
+    this.renderer.shadowMap.enabled = true;
+    this.renderer.shadowMap.autoUpdate = false; // shadows stay while the camera moves
     this.scene = new Scene();
     this.scene.background = new Color("#ffffff");
     this.camera = new PerspectiveCamera(FIELD, 1, this.radius / 50, this.radius * 50);
     this.camera.up.set(0, 0, 1);
-    const light = new DirectionalLight("#ffffff", 1.6);
-    light.position.set(-0.4, 0.6, 1);
-    this.camera.add(light);
-    this.scene.add(this.camera, new HemisphereLight("#ffffff", "#aab0b6", 2.6));
+    const lamp = new DirectionalLight("#ffffff", 0.9); // goes with the camera
+    lamp.position.set(-0.4, 0.6, 1);
+    this.camera.add(lamp);
+    this.scene.add(this.camera, new HemisphereLight("#ffffff", "#b4bac2", 2.2), ...this.makeSun());
     this.controls = new OrbitControls(this.camera, canvas);
     this.controls.minDistance = this.radius / 10;
     this.controls.maxDistance = this.radius * 15;
     this.listeners = [];
     this.start = start;
     this.isAsked = false;
-    this.controls.addEventListener("change", () => this.draw());
+    this.controls.addEventListener("change", () => this.draw(false));
     canvas.addEventListener("keydown", (event) => this.answerKey(event));
+  }
+
+  /** Return a light from above with its target, and the floor that shows its shadows. */
+  makeSun() {
+    const sun = new DirectionalLight("#ffffff", 1.7);
+    const { radius, middle } = this;
+    sun.position.set(-0.35, -0.15, 1.6).multiplyScalar(2 * radius).add(middle);
+    sun.target.position.copy(middle);
+    sun.castShadow = true;
+    sun.shadow.mapSize.set(2048, 2048);
+    sun.shadow.radius = 3;
+    sun.shadow.normalBias = 0.004 * radius;
+    const { camera } = sun.shadow;
+    [camera.left, camera.right, camera.bottom, camera.top] = [-1.5, 1.5, -1.5, 1.5].map((k) => k * radius);
+    [camera.near, camera.far] = [0.1 * radius, 8 * radius];
+    const floor = new Mesh(new PlaneGeometry(8 * radius, 8 * radius), new ShadowMaterial({ opacity: 0.2 }));
+    floor.position.set(middle.x, middle.y, this.low - 0.001 * radius);
+    floor.receiveShadow = true;
+    return [sun, sun.target, floor];
   }
 
   /** Call a function after each drawing. */
@@ -62,8 +84,9 @@ export class Stage {
     this.draw();
   }
 
-  /** Draw once before the next picture of the screen. */
-  draw() {
+  /** Draw once before the next picture of the screen; shadows, too, where shapes have moved. */
+  draw(hasMoved = true) {
+    this.renderer.shadowMap.needsUpdate ||= hasMoved;
     if (this.isAsked) return;
     this.isAsked = true;
     requestAnimationFrame(() => {
@@ -115,14 +138,14 @@ export class Stage {
     const { x, y, z } = new Vector3().setFromSpherical(place);
     this.camera.position.set(x, -z, y).add(this.controls.target);
     this.controls.update();
-    this.draw();
+    this.draw(false);
   }
 
   /** Come closer (below 1) or go away from the middle. */
   zoom(factor) {
     this.camera.position.sub(this.controls.target).multiplyScalar(factor).add(this.controls.target);
     this.controls.update();
-    this.draw();
+    this.draw(false);
   }
 
   answerKey(event) {

@@ -4,9 +4,9 @@
 
 import { Group } from "three";
 import { addScaled, findBounds, pointOf, readScene, roundDown } from "./data.js";
-import { make, makeButton, makeChoice, makeLayer, makeLegend } from "./panel.js";
+import { make, makeButton, makeChoice, makeLayer, makeLegend, makeSlider } from "./panel.js";
 import { Robot } from "./robot.js";
-import { Arrows, Points, makeLines } from "./shapes.js";
+import { Arrows, Points, makeLines, makeSolid } from "./shapes.js";
 import { Stage } from "./stage.js";
 
 const KEYS = "Drag to rotate, scroll to zoom. Keyboard: arrow keys rotate, + and - zoom, Home resets.";
@@ -20,6 +20,7 @@ function makeGrid(bounds, scene) {
   const [x0, y0] = [0, 1].map((k) => Math.floor(bounds.low[k] / step) * step);
   const [x1, y1] = [0, 1].map((k) => Math.ceil(bounds.high[k] / step) * step);
   const z = bounds.low[2] - 0.02 * scene.size;
+  bounds.floor = z;
   const points = [];
   for (let i = 0; i <= Math.round((x1 - x0) / step); i++) points.push(x0 + i * step, y0, z, x0 + i * step, y1, z);
   for (let i = 0; i <= Math.round((y1 - y0) / step); i++) points.push(x0, y0 + i * step, z, x1, y0 + i * step, z);
@@ -50,25 +51,66 @@ function describePose(scene, choice) {
 function makeLayers(scene, thickness) {
   const { tools, errors, magnification, colors } = scene.poses;
   const count = tools.length / 3;
-  const poses = new Points(new Array(count).fill(colors.pose), new Array(count).fill(1.1 * thickness), false, false);
-  const arrows = new Arrows(count, colors.error, 0.35 * thickness);
-  for (let i = 0; i < count; i++) {
-    const tool = pointOf(tools, i);
-    poses.place(i, tool);
-    arrows.place(i, tool, addScaled(tool, pointOf(errors, i), magnification));
-  }
+  const poses = new Points(new Array(count).fill(colors.pose), new Array(count).fill(0.5 * thickness), false, false);
+  const arrows = new Arrows(count, colors.error, 0.3 * thickness);
+  for (let i = 0; i < count; i++) poses.place(i, pointOf(tools, i));
+  const scale = (factor) => {
+    for (let i = 0; i < count; i++) arrows.place(i, pointOf(tools, i), addScaled(pointOf(tools, i), pointOf(errors, i), factor));
+  };
+  scale(magnification);
   const layers = { poses: new Group(), errors: new Group(), map: new Group() };
   if (count) {
     layers.poses.add(poses.mesh);
     layers.errors.add(...arrows.meshes);
   }
   if (scene.map) {
-    const { points, colors: shades } = scene.map;
-    const map = new Points(shades, new Array(shades.length).fill(0.9 * thickness), true, false);
+    const { points, colors: shades, hull, largest } = scene.map;
+    const map = new Points(shades, new Array(shades.length).fill(0.3 * thickness), true, false);
     shades.forEach((_, i) => map.place(i, pointOf(points, i)));
-    layers.map.add(map.mesh);
+    const mark = new Points([shades[largest.index]], [1.4 * thickness], false);
+    mark.place(0, pointOf(points, largest.index));
+    layers.map.add(map.mesh, mark.mesh);
+    if (hull.length) layers.map.add(makeSolid(points, hull, shades));
   }
-  return layers;
+  return { layers, scale };
+}
+
+/** Return the controls of a second robot, which shows the motions of a scene larger than they are. */
+function controlMotions(scene, ghost, stage, said) {
+  const moved = new Float32Array(scene.home.length);
+  let shown = null;
+  let began = 0; // time of the first picture of a motion that plays; 0 where none plays
+  ghost.group.visible = false;
+  const place = (share) => {
+    for (let i = 0; shown && i < moved.length; i++) moved[i] = scene.home[i] + share * shown.shift[i];
+    ghost.group.visible = Boolean(shown);
+    if (shown) ghost.show(moved, 0);
+    stage.draw();
+    return shown ? `x ${format(share * shown.magnification, 2)}` : "";
+  };
+  const slider = makeSlider("magnified", -1, 1, 1, place);
+  const play = makeButton("play", () => {
+    began = began ? 0 : performance.now();
+    play.textContent = began ? "stop" : "play";
+    if (began) requestAnimationFrame(move);
+  });
+  const move = (time) => {
+    if (!began) return;
+    slider.input.value = Math.cos((time - began) / 600);
+    slider.answer();
+    requestAnimationFrame(move);
+  };
+  const names = scene.motions.map(({ name }) => name);
+  const choice = makeChoice("Second robot", "none", names, (index) => {
+    shown = index < 0 ? null : scene.motions[index];
+    slider.input.value = 1;
+    said.textContent = shown ? shown.text : "";
+    for (const element of [slider.field, play]) element.hidden = !shown;
+    if (!shown && began) play.click();
+    slider.answer();
+  });
+  choice.select.dispatchEvent(new Event("change"));
+  return [choice.field, slider.field, play];
 }
 
 /** Return the entries of the legend. */
@@ -80,16 +122,16 @@ function listMeanings(scene, step) {
 
 /** Write names beside points of the canvas, again after each drawing. */
 function attachNames(stage, overlay, names) {
-  const written = names.map(({ text, color, point }) => {
+  const written = names.map(({ text, color, point, layer }) => {
     const element = make("span", {}, text);
     element.style.color = color;
     overlay.append(element);
-    return { element, point };
+    return { element, point, layer };
   });
   stage.onDraw(() => {
-    for (const { element, point } of written) {
+    for (const { element, point, layer } of written) {
       const { x, y, isAhead } = stage.project(point);
-      element.hidden = !isAhead;
+      element.hidden = !isAhead || layer?.visible === false;
       element.style.transform = `translate(${x.toFixed(1)}px, ${y.toFixed(1)}px)`;
     }
   });
@@ -106,17 +148,18 @@ function open(figure) {
   });
   const { lines, step } = makeGrid(bounds, scene);
   const stage = new Stage(canvas, bounds, start);
-  const thickness = 0.007 * scene.size;
+  const thickness = 0.011 * scene.size;
   const robot = new Robot(scene, thickness);
-  const layers = makeLayers(scene, thickness);
-  const marker = new Points([scene.poses.colors.pose], [2.2 * thickness], false, false);
+  const { layers, scale } = makeLayers(scene, thickness);
+  const ghost = new Robot(scene, 0.9 * thickness, scene.poses.colors.error);
+  const marker = new Points([scene.poses.colors.pose], [1.1 * thickness], false, false);
   marker.mesh.visible = false;
   layers.map.visible = false;
-  stage.scene.add(robot.group, lines, marker.mesh, ...Object.values(layers));
+  stage.scene.add(robot.group, ghost.group, lines, marker.mesh, ...Object.values(layers));
 
   const said = make("output", {}, describePose(scene, -1));
   const { labels, rows, tools, robots } = scene.poses;
-  const choice = makeChoice(labels, (index) => {
+  const choice = makeChoice("Robot at pose", "home", labels, (index) => {
     robot.show(index < 0 ? scene.home : robots, Math.max(index, 0) * robot.count);
     marker.mesh.visible = index >= 0;
     if (index >= 0) marker.place(0, pointOf(tools, rows[index]));
@@ -129,16 +172,28 @@ function open(figure) {
     layers[name].visible = isShown;
     stage.draw();
   };
-  if (tools.length) controls.append(makeLayer("poses", true, toggle("poses")), makeLayer("errors", true, toggle("errors")));
+  if (tools.length) {
+    const slider = makeSlider("errors magnified", -1, 1, 0, (power) => {
+      const factor = Number((scene.poses.magnification * 10 ** power).toPrecision(2));
+      scale(factor);
+      stage.draw();
+      return `x ${factor}`;
+    });
+    slider.answer();
+    controls.append(makeLayer("poses", true, toggle("poses")), makeLayer("errors", true, toggle("errors")), slider.field);
+  }
   if (scene.map) controls.append(makeLayer("uncertainty over the workspace", false, toggle("map")));
   for (const name of ["perspective", "above", "front", "right"]) {
     controls.append(makeButton(name === "perspective" ? "reset view" : `from ${name === "right" ? "the right" : name === "front" ? "the front" : name}`,
       () => stage.look(name === "perspective" ? start : name)));
   }
+  const told = make("span", { "aria-live": "polite" });
+  if (scene.motions.length) controls.append(...controlMotions(scene, ghost, stage, told));
   const overlay = make("div", { class: "names", "aria-hidden": "true" });
   const place = make("div", { class: "place" }, canvas, overlay);
   const view = make("div", { class: "viewer" }, place, controls);
   if (labels.length) view.append(make("p", {}, said));
+  if (scene.motions.length) view.append(make("p", {}, told));
   view.append(makeLegend(listMeanings(scene, step)), make("p", {}, KEYS));
   figure.prepend(view);
   figure.classList.add(LIVE);
@@ -147,7 +202,12 @@ function open(figure) {
     view.remove();
   });
 
-  attachNames(stage, overlay, scene.names);
+  const names = [...scene.names];
+  if (scene.map) {
+    const { index, text } = scene.map.largest;
+    names.push({ text, color: "#1b1f24", point: pointOf(scene.map.points, index), layer: layers.map });
+  }
+  attachNames(stage, overlay, names);
   stage.onSelect(
     rows.map((row) => pointOf(tools, row)),
     (index) => {

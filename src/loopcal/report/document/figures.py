@@ -8,6 +8,8 @@ from dataclasses import replace
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from loopcal.apply.accuracy import AccuracyMap, accuracy_map
 from loopcal.errors import LoopcalError
 from loopcal.estimate.result import KindResiduals
@@ -26,13 +28,24 @@ from loopcal.report.figures.result_figures import (
 )
 from loopcal.report.figures.robot_figure import draw_scene
 from loopcal.report.pictures import inline_figure
-from loopcal.report.scene.scene import Scene, choose_rows, compute_pose_errors, format_scene
+from loopcal.report.scene.scene import (
+    Motion,
+    Scene,
+    choose_rows,
+    compute_motion,
+    compute_pose_errors,
+    format_scene,
+)
+from loopcal.units import find_unit
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MOST_ROWS, MOST_PARAMETERS = 3000, 120
 """Rows that the figures of a report show, and parameters up to which it draws them."""
+
+MOST_MOTIONS = 20
+"""Undetermined combinations that the 3-D view can show."""
 
 MAP_POSES, SEED = 200, 0
 """Poses of the accuracy map, and the seed of their draw."""
@@ -174,7 +187,7 @@ def draw_scene_picture(record: CalibrationRecord) -> Iterator[Element]:
         labels = tuple(str(i + 1) for i in range(count))
     shown = tuple(labels[i] for i in rows)
     poses = compute_pose_errors(record.robot, record.initial, readings[rows], shown)
-    scene = Scene(record.robot, poses, accuracy)
+    scene = Scene(record.robot, poses, accuracy, tuple(_list_motions(record)))
     in_space = len(choose_rows(record.robot, len(poses.tool)))
     if in_space < len(poses.tool):
         yield f"The 3-D view can show the robot at {in_space:,} of these poses, evenly spread."
@@ -189,6 +202,30 @@ def draw_scene_picture(record: CalibrationRecord) -> Iterator[Element]:
         f"base frame of the robot file.{'' if accuracy is None else of_map}",
         format_scene(scene),
     )
+
+
+def _list_motions(record: CalibrationRecord) -> Iterator[Motion]:
+    """Yield how the robot at home moves by its errors before calibration, and by each combination
+    of parameters that the data do not determine.
+    """
+    robot = record.robot
+    names = list(robot.parameters.names)
+    changes = [
+        (
+            record.initial.values - robot.values,
+            "before calibration",
+            "The second robot is the geometry before calibration at the same readings.",
+        )
+    ]
+    for row in record.result["fit"].get("unidentifiable", ()):
+        change = np.zeros(len(names))
+        for name, value, unit in zip(row["names"], row["changes"], row["units"], strict=True):
+            if name in names:
+                change[names.index(name)] = value * find_unit(unit).factor_to_si
+        changes.append((change, f"not determined: {', '.join(row['names'][:3])}", row["sentence"]))
+    for change, name, text in changes[: MOST_MOTIONS + 1]:
+        if (motion := compute_motion(robot, change, name, text)) is not None:
+            yield motion
 
 
 @report_figure("workspace")

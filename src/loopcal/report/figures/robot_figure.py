@@ -34,6 +34,7 @@ from loopcal.report.figures.style import (
 )
 from loopcal.report.scene.scene import Part, Role, Scene, is_planar, list_parts
 from loopcal.results.presenters import register
+from loopcal.results.tables import choose_unit
 from loopcal.typing import FloatArray
 from loopcal.units import DISPLAY_UNITS, Dimension, find_unit
 
@@ -112,6 +113,7 @@ def _choose_style(part: Part) -> dict[str, Any]:
         "joint": _dot("o", color, face, 8.0 if part.is_driven else 5.0),
         "slide": _dot("s", color, face, 8.0 if part.is_driven else 5.0),
         "rod": {"color": color, "lw": 1.6},
+        "cable": {"color": color, "lw": 1.0},
         "rod drive": _dot("D", color, face),
         "end": _dot("o", color, "white"),
         "base": {"color": "0.6", "lw": 1.0, "ls": ":", "zorder": 0.5},
@@ -220,7 +222,7 @@ def _draw_map(
     factor: float,
 ) -> None:
     """Draw the uncertainty of positions where it is known, with its scale of colors."""
-    unit = DISPLAY_UNITS[Dimension.LENGTH]
+    unit = choose_unit(DISPLAY_UNITS[Dimension.LENGTH], accuracy.uncertainty.position)
     values = accuracy.uncertainty.position / unit.factor_to_si
     known = np.isfinite(values) & np.isfinite(scene.map_points).all(axis=1)
     if not known.any():

@@ -21,17 +21,24 @@ import numpy as np
 from loopcal.apply.accuracy import AccuracyMap
 from loopcal.engine import State
 from loopcal.mechanism.assembly import BASE, PLATFORM
-from loopcal.mechanism.kinematics import compute_limb_frames, locate_anchors
+from loopcal.mechanism.kinematics import compute_limb_frames, compute_readings, locate_anchors
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.solutions import Solution, forward
 from loopcal.numerics.statistics import choose_evenly
 from loopcal.plain_text import escape
 from loopcal.report.figures.style import COLORS, ERROR, FRAME_COLORS, POSE, SEQUENTIAL
+from loopcal.results.tables import choose_unit, format_number
 from loopcal.typing import FloatArray, IntArray
 from loopcal.units import DISPLAY_UNITS, Dimension, Unit, find_unit
 
 LONGEST = 0.15
-"""Length of the longest drawn error, as a share of the robot's size."""
+"""Length of the longest drawn error or motion, as a share of the robot's size."""
+
+STEP = 1e-4
+"""Largest change of a value in a difference quotient, in robot sizes or as an angle."""
+
+SMALLEST = 1e-9
+"""Error or motion that is not drawn larger, as a share of the robot's size."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +60,22 @@ class PoseErrors:
 
 
 @dataclass(frozen=True, eq=False)
+class Motion:
+    """How a change of parameters moves a robot at home, while its readings stay.
+
+    Attributes
+    ----------
+    name : short, for a list. text : a sentence.
+    shift : (P, 3) of the points of all parts [m]. magnification : by which it is drawn.
+    """
+
+    name: str
+    text: str
+    shift: FloatArray
+    magnification: float
+
+
+@dataclass(frozen=True, eq=False)
 class Scene:
     """A robot at home.
 
@@ -60,11 +83,13 @@ class Scene:
     ----------
     poses : with their errors; None without a calibration.
     accuracy : uncertainty over the workspace; None where it is not known.
+    motions : by the errors before calibration, and by combinations that are not determined.
     """
 
     robot: Mechanism
     poses: PoseErrors | None = None
     accuracy: AccuracyMap | None = None
+    motions: tuple[Motion, ...] = ()
 
     @property
     def map_points(self) -> FloatArray:
@@ -86,11 +111,55 @@ def compute_pose_errors(
     reached = np.flatnonzero(after.converged & before.converged)
     tool = (after.T[reached] @ robot.tool)[:, :3, 3]
     error = (before.T[reached] @ initial.tool)[:, :3, 3] - tool
-    longest, magnification = float(np.sqrt((error**2).sum(axis=1)).max(initial=0.0)), 1.0
-    if longest > 1e-9 * robot.size:
-        magnification = round_down(LONGEST * robot.size / longest)
+    longest = float(np.sqrt((error**2).sum(axis=1)).max(initial=0.0))
+    room = min(LONGEST * robot.size, 2.0 * _find_spacing(tool, robot.size))
+    magnification = _choose_magnification(longest, room, robot.size)
     named = tuple(labels[i] for i in reached)
     return PoseErrors(named, after.take(reached), tool, error, magnification)
+
+
+def _find_spacing(points: FloatArray, size: float) -> float:
+    """Return the median distance from points (n, 3) to the nearest one at another place [m];
+    infinite without two places. Errors of near poses are alike, so that lines of twice this length
+    run side by side.
+    """
+    from scipy.spatial import KDTree
+
+    places = np.unique(np.round(points / (1e-3 * size)), axis=0) * 1e-3 * size
+    if len(places) < 2:
+        return math.inf
+    return float(np.median(KDTree(places).query(places, k=2)[0][:, 1]))
+
+
+def compute_motion(robot: Mechanism, change: FloatArray, name: str, text: str) -> Motion | None:
+    """Return how a change (p,) of all values [SI] moves a robot; None where it does not move, or
+    where the readings of home lead to no pose.
+
+    shift = (points(values + h change / 2) - points(values - h change / 2)) / h, with a small h
+    """
+    if not np.any(change):
+        return None
+    h = STEP * robot.size / float(np.abs(change).max())
+    home = compute_readings(robot, robot.values[None], robot.home_state)[0]
+    ends = []
+    for side in (0.5 * h, -0.5 * h):
+        machine = robot.with_values(robot.values + side * change)
+        solution = forward(machine, home)
+        if not solution.converged.all():
+            return None
+        ends.append(_join(list_parts(machine, solution.state))[0])
+    shift = (ends[0] - ends[1]) / h
+    longest = float(np.sqrt((shift**2).sum(axis=1)).max())
+    if longest <= SMALLEST * robot.size:
+        return None
+    return Motion(
+        name, text, shift, _choose_magnification(longest, LONGEST * robot.size, robot.size)
+    )
+
+
+def _choose_magnification(longest: float, room: float, size: float) -> float:
+    """Return by which factor lengths [m] are drawn, of which the longest gets this room."""
+    return round_down(room / longest) if longest > SMALLEST * size else 1.0
 
 
 def round_down(value: float) -> float:
@@ -112,16 +181,16 @@ meet, and up to which distance points are one, all as shares of the robot's size
 """
 
 Role = Literal[
-    "limb", "axis", "guide", "joint", "slide", "rod", "rod drive", "end",
+    "limb", "axis", "guide", "joint", "slide", "rod", "cable", "rod drive", "end",
     "base", "platform", "arm", "frame", "tool",
 ]  # fmt: skip
 """What a part is: the line along a limb; the axis and the place of a joint; the guide and the place
-of a slide; a rod, where it is driven, the end of a limb; the outlines of base and platform; the
-line from the platform to the tool, or from the anchors of a triangle drive to its joint; an axis of
-a frame; the tool point.
+of a slide; a rod, or the cable of a spool, and where it is driven; an end of a limb; the outlines
+of base and platform; the line from the platform to the tool, or from the anchors of a triangle
+drive to its joint; an axis of a frame; the tool point.
 """
 
-LINES = ("limb", "axis", "guide", "rod", "base", "platform", "arm", "frame")
+LINES = ("limb", "axis", "guide", "rod", "cable", "base", "platform", "arm", "frame")
 """Roles of lines; all others are single points."""
 
 PLANAR = {"x", "y", "rz"}
@@ -208,8 +277,14 @@ def _list_joints(robot: Mechanism, i: int, frames: FloatArray) -> Iterator[Part]
             yield Part("joint", points[:, j, None], i, is_driven)
     if limb.ending == "distance":
         is_driven, rod = bool(limb.actuator), points[:, -2:]
-        yield Part("rod", rod, i)
-        place = rod.mean(axis=1, keepdims=True) if is_driven else rod[:, :1]
+        is_cable = any(
+            actuator.name == limb.actuator and actuator.dimension is Dimension.ANGLE
+            for actuator in robot.actuators
+        )
+        yield Part("cable" if is_cable else "rod", rod, i, is_driven)
+        if is_driven and not is_cable:
+            yield Part("end", rod[:, :1], i)
+        place = rod.mean(axis=1, keepdims=True) if is_driven and not is_cable else rod[:, :1]
         yield Part("rod drive", place, i, is_driven)
     if limb.ending != "rigid":
         yield Part("end", points[:, -1:], i)
@@ -220,7 +295,7 @@ def _list_triangles(robot: Mechanism, state: State) -> Iterator[Part]:
     for anchors in locate_anchors(robot, state):
         foot, head = np.moveaxis(anchors.points, 1, 0)
         yield Part("arm", np.stack([foot, anchors.pin, head], axis=1))
-        yield Part("rod", anchors.points, anchors.limb)
+        yield Part("rod", anchors.points, anchors.limb, True)
         yield Part("rod drive", anchors.points.mean(axis=1, keepdims=True), anchors.limb, True)
         yield Part("end", anchors.points[:, 1:], anchors.limb)
 
@@ -269,7 +344,11 @@ def _order_outline(points: FloatArray) -> IntArray:
     _, s, V = np.linalg.svd(offset, full_matrices=True)
     if len(points) < 3 or s[1] < 1e-6 * max(s[0], 1e-300):
         return np.arange(len(points))
-    order = np.argsort(np.arctan2(offset @ V[1], offset @ V[0]))
+    normal = V[2] * np.sign(V[2, np.argmax(np.abs(V[2]))])
+    size = np.linalg.norm(offset, axis=1)
+    first = offset[np.argmax(size > 0.5 * size.max())]  # two similar robots have one order
+    angle = np.arctan2(offset @ np.cross(normal, first), offset @ first)
+    order = np.argsort(np.where(angle < -COINCIDENT, angle + 2.0 * np.pi, angle))
     return np.append(order, order[0])
 
 
@@ -313,6 +392,15 @@ def format_scene(scene: Scene) -> str:
         "names": _list_names(robot, parts, unit),
         "poses": _describe_poses(scene, unit),
         "map": _describe_map(scene, unit),
+        "motions": [
+            {
+                "name": escape(motion.name),
+                "text": escape(motion.text),
+                "shift": _encode(motion.magnification * motion.shift / unit.factor_to_si),
+                "magnification": motion.magnification,
+            }
+            for motion in scene.motions
+        ],
         "legend": _list_legend(scene, parts),
     }
     return json.dumps(data, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
@@ -330,7 +418,7 @@ def _join(parts: tuple[Part, ...]) -> FloatArray:
 
 def describe_part(part: Part) -> dict[str, Any]:
     """Return how a part is drawn."""
-    colors = {"axis": BLACK, "tool": BLACK, "platform": BODY, "arm": BODY, "base": BODY}
+    colors = {"axis": BLACK, "tool": BLACK, "platform": BODY, "arm": BODY, "base": "#8a94a0"}
     color = COLORS[part.index % len(COLORS)] if part.index >= 0 else BODY
     if part.role == "frame":
         color = FRAME_COLORS[part.index]
@@ -378,7 +466,9 @@ def _describe_poses(scene: Scene, unit: Unit) -> dict[str, Any]:
 
 
 def _describe_map(scene: Scene, unit: Unit) -> dict[str, Any] | None:
-    """Return the reached poses of the accuracy map with their colors."""
+    """Return the reached poses of the accuracy map with their colors, the triangles of the solid
+    around them, and the place of the largest uncertainty.
+    """
     from matplotlib import colormaps
     from matplotlib.colors import Normalize, to_hex
 
@@ -394,7 +484,23 @@ def _describe_map(scene: Scene, unit: Unit) -> dict[str, Any] | None:
         to_hex(colormaps[SEQUENTIAL](scale(value))) if np.isfinite(value) else UNBOUNDED
         for value in values[reached]
     ]
-    return {"points": _encode(points[reached] / unit.factor_to_si), "colors": shades}
+    shown, largest = (
+        points[reached],
+        int(np.argmax(np.where(known[reached], values[reached], -1.0))),
+    )
+    hull = np.zeros((0, 3), dtype=int)
+    if len(shown) > 3 and np.linalg.matrix_rank(shown - shown[0], tol=1e-3 * scene.robot.size) == 3:
+        from scipy.spatial import ConvexHull
+
+        hull = ConvexHull(shown).simplices
+    length = choose_unit(DISPLAY_UNITS[Dimension.LENGTH], values)
+    most = values[reached][largest] / length.factor_to_si
+    return {
+        "points": _encode(shown / unit.factor_to_si),
+        "colors": shades,
+        "hull": hull.ravel().tolist(),
+        "largest": {"index": largest, "text": f"largest: {format_number(most, 2)} {length.symbol}"},
+    }
 
 
 def _list_legend(scene: Scene, parts: tuple[Part, ...]) -> list[dict[str, str]]:
@@ -424,7 +530,8 @@ def _describe_scale(scene: Scene) -> tuple[tuple[str, str, bool], ...]:
 
     if scene.accuracy is None:
         return ()
-    unit, values = DISPLAY_UNITS[Dimension.LENGTH], scene.accuracy.uncertainty.position
+    values = scene.accuracy.uncertainty.position
+    unit = choose_unit(DISPLAY_UNITS[Dimension.LENGTH], values)
     known = values[np.isfinite(values)] / unit.factor_to_si
     if not len(known):
         return ()
