@@ -14,7 +14,7 @@ these poses; AP is then what remains after the best fit, while RP does not chang
 Intervals of 95 %, for normal errors: of AP_p from the noncentral chi-square distribution of the
 squared mean over its variance, of RP_l from drawn visits with the same scatter (the ratio of their
 RP_l to the true one hardly depends on it), of AP_a from Student's t and of RP_a from chi-square.
-Derivation and measured coverage: docs/theory/repeatability.md.
+Derivation and measured coverage: docs/theory/accuracy.md.
 """
 
 from __future__ import annotations

@@ -10,7 +10,7 @@ errors are drawn from their stated distributions.
     pairs    blocks are drawn with replacement: multinomial weights
     normal   independent normal errors of the stated sigmas (Monte Carlo, JCGM 101)
 
-See docs/theory/resampling.md.
+See docs/theory/uncertainty.md.
 """
 
 from __future__ import annotations

@@ -10,7 +10,7 @@ fit, whose rows have variance sigma^2, the cluster-robust covariance is
 The factor (I - H_gg)^(-1/2) is the small-sample correction CR2 of Bell and McCaffrey (2002): for
 independent errors the expectation of C_robust is exactly C. Its scatter is that of a chi-square
 whose degrees of freedom have the moments of the quadratic form (Satterthwaite; Pustejovsky and
-Tipton, 2018). See docs/theory/resampling.md.
+Tipton, 2018). See docs/theory/uncertainty.md.
 """
 
 from __future__ import annotations

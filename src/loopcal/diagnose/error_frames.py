@@ -14,7 +14,7 @@ platform frames, the error of a pose in any of these frames is
 
 In the last two, motions of the platform that the measurements do not determine are fitted, too.
 Rotations are multiplied by the robot's size in the fit, and displacements are those of the tool.
-Derivation: docs/theory/gauge.md.
+Derivation: docs/theory/observability.md.
 """
 
 from __future__ import annotations

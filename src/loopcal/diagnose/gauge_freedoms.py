@@ -8,7 +8,7 @@ equals (R w, R c). Such a direction is a gauge freedom: it changes no dimension 
 where its frames are placed. The poses are some of the stated workspace, and some about home. All
 statements on undetermined combinations follow from this one place. Bodies beside the platform, such
 as the other finger of a gripper, are outputs as well: what moves none but them is named with them.
-See docs/theory/gauge.md.
+See docs/theory/observability.md.
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@ Intervals of all q quantities at once have the half-width k sd with
     bonferroni   single level (1 - level) / q
     scheffe      sqrt(c): holds for all linear combinations, too
 
-See docs/theory/resampling.md.
+See docs/theory/uncertainty.md.
 """
 
 from __future__ import annotations

@@ -5,7 +5,7 @@ Draws come from a multivariate t distribution about the estimate with the covari
 that its tails are heavier than those of the posterior. Each draw gets the exact density of all rows
 and priors, with the kinematics solved at it, divided by the density of the proposal (importance
 sampling). Where few draws have all the weight, the proposal is moved to them, and drawn from again.
-See docs/theory/resampling.md.
+See docs/theory/uncertainty.md.
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@ its tilt and its distance change no measured value to first order. Left free, th
 order, as a scale of x and y, and take errors of the machine away. The columns of an item by its own
 numbers are collected at its stated place, over measured poses and over poses of the workspace. A
 combination without effect on both is removed by fixing a coordinate, of a rotation first, at its
-stated value. See docs/theory/gauge.md.
+stated value. See docs/theory/observability.md.
 """
 
 from __future__ import annotations

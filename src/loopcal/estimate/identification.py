@@ -320,7 +320,7 @@ def identify(
     ----------
     robot : its values are the start; its table states what is nominal, free and tolerated.
     data : the measurements. Where a reading has a sigma, given or stated by the robot, its pose is
-        estimated as well (docs/theory/uncertain-readings.md).
+        estimated as well (docs/theory/identification.md).
     method, loss : in place of those of `options`.
     options : see `FitOptions`. By default stated tolerances are a prior, which is inflated where
         the data contradict it.

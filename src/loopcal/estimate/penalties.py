@@ -14,7 +14,7 @@ total deviation, the estimate is z = sum_i f_i (c_i / s_i) v_i with the filter f
 
 The penalty acts on the total deviation from nominal in units of tolerance, never on the step, so
 the answer does not depend on the number of iterations. A new method is one more class here, and
-its line in `loopcal.estimate.methods`. See docs/theory/estimation.md.
+its line in `loopcal.estimate.methods`. See docs/theory/identification.md.
 """
 
 from __future__ import annotations

@@ -11,7 +11,7 @@ the kinematics, the rows of its component are stacked, the coordinates of the co
 eliminated by projection, and what is left determines the nuisance parameters; the best coordinates
 follow. A step is no longer than closure is about linear, and one that does not lower the sum of
 squares is halved. An exact reading has no coordinate: its row is not a heavy one, it does not
-exist. See docs/theory/uncertain-readings.md.
+exist. See docs/theory/identification.md.
 
 Rows are made block by block. Poses without coordinates are divided into runs of consecutive ones.
 Rows that link poses of different runs form blocks of their own, with the poses that they name, so

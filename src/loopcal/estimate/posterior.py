@@ -69,7 +69,7 @@ class CovariancePart(NamedTuple):
 def combine_degrees(total: FloatArray, squares: Iterable[tuple[FloatArray, float]]) -> FloatArray:
     """Return the effective degrees of freedom (..,) of variances u^2 = `total`, from the variance
     and the degrees of freedom nu_i of each part u_i^2 that was estimated (Welch-Satterthwaite, JCGM
-    100, G.4):
+    100, equation G.2b):
 
         degrees = u^4 / sum(u_i^4 / nu_i)
 

@@ -11,7 +11,7 @@ platform's twist, and the error model D = d twist / d parameter, the row is
 the coordinates of poses whose readings are uncertain (block by block, while rows are made), then
 groups, sessions and what all rows share. What is left is folded into one triangular factor, so that
 the memory of a fit is its parameters squared plus one block. See docs/theory/identification.md and
-docs/theory/uncertain-readings.md.
+docs/theory/identification.md.
 
 The rank of a Jacobian with residuals contains second-order terms. Turn a robot with its surfaces
 about a line: what is left between the points and the line turns as well, so that a first-order row

@@ -5,7 +5,7 @@ The test takes what no parameter can explain: the part of the rows outside the r
 parameters. No penalty and no prior enters it, so that wrong tolerances are not reported as noise.
 
 A stated sigma is taken as known to within a relative standard uncertainty u. That is knowledge of
-nu0 = 1 / (2 u^2) degrees of freedom (JCGM 100, G.4.2), to which the residuals add their own:
+nu0 = 1 / (2 u^2) degrees of freedom (JCGM 100, equation G.3), to which the residuals add their own:
 
     s^2 = (nu0 + unexplained) / (nu0 + degrees)        with nu0 + degrees degrees of freedom
 
@@ -59,7 +59,7 @@ NO_NOISE = 1e-3
 
 SIGMA_UNCERTAINTY = 0.25
 """Relative standard uncertainty of the stated sigmas, where nothing else is said: the reliability
-that JCGM 100, G.4.2, gives as its example.
+of the example in JCGM 100, G.4.2.
 """
 
 ASSUMED_UNCERTAINTY = 0.5

@@ -5,7 +5,7 @@ Let M (6, 12) be the twist of a pose by a motion g of the two frames, J the deri
 row by that twist, and F that by the setup parameters (frames, targets, surfaces, offsets). A motion
 g that solves `J M g + F b = 0` for all rows, with any b, changes no measured value. The solutions
 are the null space of what is left of J M once F is eliminated. A setup parameter with a stated
-tolerance adds its row; tolerances of the machine do not. See docs/theory/gauge.md.
+tolerance adds its row; tolerances of the machine do not. See docs/theory/observability.md.
 """
 
 from __future__ import annotations

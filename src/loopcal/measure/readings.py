@@ -179,7 +179,7 @@ def resolve_reading_sigma(robot: Mechanism, given: FloatArray | None, n: int) ->
 
     DataError : a sigma is no standard deviation, or too large to mean anything; or a reading of a
         robot with redundant actuators is exact. The poses of such a robot are free and readings
-        follow from them, see docs/theory/uncertain-readings.md.
+        follow from them, see docs/theory/identification.md.
     """
     if given is None:
         if not robot.stated_sigma.any():

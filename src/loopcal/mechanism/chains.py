@@ -3,7 +3,7 @@
 
 With T_s = T_parent M_s X_s(q_s), M_s the mount and X_s the pose of stage s in its own base, the
 twist of the end platform is the sum of the twists of the stages that carry it, each transported:
-omega = R_s omega_s, v = R_s v_s + omega x (p_end - p_s). Derivation: docs/theory/stages.md.
+omega = R_s omega_s, v = R_s v_s + omega x (p_end - p_s). Derivation: docs/theory/kinematics.md.
 """
 
 from __future__ import annotations

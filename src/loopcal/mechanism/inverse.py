@@ -5,7 +5,7 @@ Where the controlled coordinates determine each limb, every actuator is free, an
 the limbs. Where one actuator drives joints of several limbs, as a carriage with two rods does, the
 joints would part; a chain of stages has no loop through its base. There Newton's method on the
 driven joints, c(T(u)) = c*, uses forward kinematics. Source: docs/theory/kinematics.md,
-docs/theory/stages.md.
+docs/theory/kinematics.md.
 """
 
 from __future__ import annotations

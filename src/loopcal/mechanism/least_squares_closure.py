@@ -13,7 +13,7 @@ their error is about 1e-10 of r, and r is small. J = QR avoids the product J'J:
     (Q'dr/du + R^-T (dJ/du)'r) du/dp = -(Q'dr/dp + R^-T (dJ/dp)'r).
 
 Arrays have N rows of poses, each with the limbs one by one. Derivation:
-docs/theory/over-constraint.md.
+docs/theory/kinematics.md.
 """
 
 from __future__ import annotations

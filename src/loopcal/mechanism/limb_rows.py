@@ -2,7 +2,7 @@
 """Linearized closure limb by limb, in blocks that fit the cache, and frames along limbs.
 
 A limb's rows are A y + E de + Q dq = 0 and, for its eliminated joints, U dtheta + A y + E de + Q dq
-= 0; they contain its own displacements and driven joints only. Derivation: docs/theory/engine.md.
+= 0; they contain only its displacements and driven joints. Derivation: docs/theory/kinematics.md.
 """
 
 from __future__ import annotations

@@ -5,7 +5,7 @@ With every actuator free, linearized closure reads A y + Q dq = 0. Combinations 
 w'A = 0 and w'Q = 0 are equations that repeat others. In statics w is a force that the limbs exert
 on each other through the platform while the actuators are free (self-stress); limb k exerts the
 wrench A_k'w_k. A change of a parameter that changes w'E de opens the loops by this much: no pose
-and no reading can close them again. Derivation: docs/theory/over-constraint.md.
+and no reading can close them again. Derivation: docs/theory/kinematics.md.
 """
 
 from __future__ import annotations

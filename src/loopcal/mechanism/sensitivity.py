@@ -4,7 +4,7 @@
 Linearized closure without passive joints reads A y + E de + Q dq = 0, so that the platform's twist
 is y = -A^-1 (E de/dp + Q dq/dp), which the engine computes. A limb's eliminated joints follow from
 U dtheta + A y + E de + Q dq = 0; these equations contain its own displacements and actuators only.
-They are computed in blocks that fit the cache. Derivation: docs/theory/engine.md.
+They are computed in blocks that fit the cache. Derivation: docs/theory/kinematics.md.
 
 Arguments are values (t | 1, p), readings q (t | 1, n, a) and the states (t, n) that they lead to.
 Failed rows have NaN.

@@ -7,7 +7,7 @@
 with w = 2 pi / period and d = +1 or -1 the direction from which the reading was approached (0 if
 unknown). A gear ratio or a spool radius is a gain. A spool whose radius changes with the line on it
 is a curve: radius r0 - b phi / (2 pi) pays out r0 phi - b phi^2 / (4 pi). Derivation:
-docs/theory/parameters.md. A table gives values at points, between which it is a broken line or a
+docs/theory/families.md. A table gives values at points, between which it is a broken line or a
 natural cubic spline, and straight beyond. Of a triangle drive this is the length of the actuator,
 from which the joint's angle follows.
 
@@ -19,7 +19,7 @@ joints. What no parameter changes are the constants of `list_constants`.
 
 Tau and constants have a row for each commanded reading and each coupling. A coupling is such a row
 without a reading, s = offset, or with one that is never commanded, such as a temperature; several
-couplings may have the same one. Derivation: docs/theory/summed-drives.md.
+couplings may have the same one. Derivation: docs/theory/kinematics.md.
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@ factor (`loopcal.engine.fold`), whose memory is the number of columns squared an
 diagonal entry is the norm of what no solution explains. Singular values, rank, solutions, filters
 and covariances come from the singular value decomposition of that factor. The product A'A is never
 formed: it would turn null directions of 1e-14 into 1e-7. Every array has a leading trial axis t.
-See docs/theory/estimation.md.
+See docs/theory/identification.md.
 """
 
 from __future__ import annotations

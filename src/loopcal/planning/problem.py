@@ -8,7 +8,7 @@ The prediction is the pose of the tool all over the workspace, with its errors
 in a stated frame, see `loopcal.diagnose.error_frames`: after the best rigid fit of the base and
 platform frames as far as no measurement of this instrument determines them. A plan states which
 error, root mean square over the workspace, a share of machines stays below. Derivations:
-docs/theory/gauge.md, docs/theory/planning.md.
+docs/theory/observability.md, docs/theory/planning.md.
 """
 
 from __future__ import annotations

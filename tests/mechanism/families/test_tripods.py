@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""3-PRS and RU-PUS-PRS: sensitivities against the loops of docs/theory/tripods.md, |v_i| = l_i,
+"""3-PRS and RU-PUS-PRS: sensitivities against the loops of docs/theory/families.md, |v_i| = l_i,
 v_i . r_i = 0 and so on, which share no code with the package; ranks, null directions.
 """
 

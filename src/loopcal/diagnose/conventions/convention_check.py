@@ -10,7 +10,7 @@ which has a chi-square distribution with as many degrees of freedom as rows wher
 noise are true. The misfit sqrt(C / rows) is then 1, and at most k where all deviations are k
 tolerances large. A wrong unit, order, sign or column gives tens to millions. Only then are other
 interpretations of the data tested (`loopcal.diagnose.conventions.interpretations`), and the data
-are refused only where one of them fits far better: see docs/theory/convention-check.md.
+are refused only where one of them fits far better: see docs/theory/residual-patterns.md.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 
 Interpretations that differ in measured values share poses and sensitivities: they are the trials of
 one problem. Every interpretation has its own nuisance parameters (frames, targets, surfaces) and
-its own excluded rows. All functions are pure; see docs/theory/convention-check.md.
+its own excluded rows. All functions are pure; see docs/theory/residual-patterns.md.
 """
 
 from __future__ import annotations

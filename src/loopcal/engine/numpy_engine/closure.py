@@ -3,7 +3,7 @@
 
 Inside, arrays carry their components first and the batch (k limbs, N rows) last, so that every
 operation runs along contiguous memory: vectors (3, k, N), matrices (3, 3, k, N), columns (r, c, k,
-N). Formulas: docs/theory/engine.md.
+N). Formulas: docs/theory/kinematics.md.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 
 Shapes are (rows, columns, batch). All operations are element-wise, so that the result of one
 matrix never depends on its neighbors, bit for bit; a singular matrix gives infinities and does not
-stop the others. Derivation: docs/theory/engine.md.
+stop the others. Derivation: docs/theory/kinematics.md.
 """
 
 from __future__ import annotations

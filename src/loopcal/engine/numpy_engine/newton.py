@@ -4,7 +4,7 @@
 A step is a Householder reduction of each limb (its own joints) and one of each node. A row has
 converged when a step below 1e-7 of the robot's size has been applied (the next one would be below
 rounding) and the reducible part of its residual is at most 1e-13 of the size; it then stays as it
-is. Derivation: docs/theory/engine.md.
+is. Derivation: docs/theory/kinematics.md.
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@
 A front has the rows of some limbs as columns of the twists of the nodes that they touch, and right
 sides. The elimination of a node joins all fronts that touch it, triangularizes its columns by
 reflections, and leaves a front of its neighbors. Along a tree of nodes no row gets longer, so that
-the cost grows with the number of nodes and not with its cube. Derivation: docs/theory/engine.md.
+the cost grows with the number of nodes, not its cube. Derivation: docs/theory/kinematics.md.
 """
 
 from __future__ import annotations

@@ -5,7 +5,7 @@ A closure row without passive joints is a wrench on the limb's tip, a moment and
 passive joints do not feel. Its product with the velocity that a displacement or a joint causes is
 the entry of that column: every link takes the wrench to its own axes once, for all its
 displacements. Shapes as in closure.py, with the r rows of a limb behind the components: (3, r, k,
-N). Formulas: docs/theory/engine.md.
+N). Formulas: docs/theory/kinematics.md.
 """
 
 from __future__ import annotations

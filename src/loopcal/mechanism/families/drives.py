@@ -908,7 +908,7 @@ def complete_triangle(
     """Return the dimensions of a triangle that, with its offset, have the effects of all others.
 
     These are two coordinates of the foot across the axis of the joint, and the one of the head that
-    changes its lever most: see docs/theory/triangle-drives.md. Arguments are as above.
+    changes its lever most: see docs/theory/kinematics.md. Arguments are as above.
     """
     across = rotation[:, :2]
     foot = sorted(np.argsort(-np.linalg.norm(across, axis=1), kind="stable")[:2].tolist())

@@ -4,7 +4,7 @@
 With `legs: rod` a leg is the distance between its two centers, l_i = |t + R p_i - b_i| = length_i +
 reading_i: seven parameters a leg, 42 in all. With `legs: ups` it is a chain of joints (see
 `hexapod_legs.py`), which can carry the complete error model and a screw that turns with the joints.
-Derivation: docs/theory/hexapod.md.
+Derivation: docs/theory/families.md.
 """
 
 from __future__ import annotations

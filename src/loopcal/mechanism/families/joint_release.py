@@ -6,7 +6,7 @@ A joint more, with the twist x at the platform, frees the direction in which thi
 x'F. Joints whose works are independent for all w, as many as equations that repeat others, leave
 none, and do not let the machine move in any other way. The freedoms that people build are tried: R
 to U, S or C, U to S, and a rotation at C or P. The machine with these joints is then built, and
-must close with drawn errors of all parameters. Derivation: docs/theory/over-constraint.md.
+must close with drawn errors of all parameters. Derivation: docs/theory/kinematics.md.
 """
 
 from __future__ import annotations

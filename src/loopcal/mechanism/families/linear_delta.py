@@ -5,7 +5,7 @@ Tower k is at radius (cos angle_k, sin angle_k). With the carriage at reading r 
 height z_k = stop_k + sqrt(arm_k^2 - radius^2) - r (`readings: drop`, counted down from the end
 stop) or z_k = stop_k + sqrt(arm_k^2 - radius^2) + r (`readings: height`). The nozzle is the lower
 point at distance arm_k from all three. Radius and angles are shared parameters
-(docs/theory/delta.md).
+(docs/theory/families.md).
 """
 
 from __future__ import annotations

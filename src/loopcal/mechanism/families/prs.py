@@ -6,7 +6,7 @@ base, whose z axis is the guide, and end in a chain frame on the platform. Their
 are those of doi:10.1177/1687814016667908: joint centers a on the platform and b on the base, offset
 q along the guide, rod length l, direction of the guide (angles thB) and of the revolute joint
 (angles thC), all in the chain frame. A tilted guide moves the carriage and does not rotate the
-revolute joint on it. Derivation: docs/theory/tripods.md.
+revolute joint on it. Derivation: docs/theory/families.md.
 """
 
 from __future__ import annotations

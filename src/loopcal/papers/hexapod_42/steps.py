@@ -4,7 +4,7 @@ methods and poses.
 
 Least squares is `identify_per_leg`, one step at a time, every equation of weight one and every
 parameter of scale one. Poses are (x, y, z, alpha, beta, gamma) [m, rad] in the paper's order.
-Derivation: docs/theory/hexapod.md.
+Derivation: docs/theory/families.md.
 """
 
 from __future__ import annotations
