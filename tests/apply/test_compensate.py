@@ -50,6 +50,13 @@ def test_readings_reach_the_controlled_coordinates_and_commands_give_these_readi
     assert (left[1:] < 0.1 * left[:-1] + 1e-12).all()  # [m], each step reduces it tenfold
 
 
+def test_four_targets_in_four_coordinates_are_not_a_pose():
+    robot = make_identified_robot("par4")
+    targets = sample_workspace(robot, 5, 2).coordinates
+    some, all_of_them = compensate(robot, targets[:4]), compensate(robot, targets)
+    np.testing.assert_allclose(some.readings, all_of_them.readings[:4], rtol=0, atol=1e-12)
+
+
 def test_hexapod_is_compensated_in_full():
     targets = sample_workspace(load_robot("hexapod-42"), 10, 3).solution.T
     result = compensate(make_identified_robot("hexapod-42"), targets)

@@ -32,7 +32,7 @@ from loopcal.mechanism.assembly import AXES, TWIST_UNITS
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import list_dimensions, read_coordinates
 from loopcal.mechanism.sensitivity import differentiate_pose
-from loopcal.mechanism.solutions import Solution, forward, inverse
+from loopcal.mechanism.solutions import Solution, are_poses, forward, inverse
 from loopcal.mechanism.states import Status
 from loopcal.mechanism.workspace import check_limits
 from loopcal.results.description import Field, fields, label_axes
@@ -222,8 +222,7 @@ def compensate(
     count = StepCounter(progress, PASSES + (steps if mode == "commands" else 0))
     count.begin(TASK)
     uncorrected = inverse(old, targets)
-    is_pose = np.shape(targets)[-2:] == (4, 4)
-    wanted = np.reshape(targets, (-1, 4, 4)) if is_pose else uncorrected.T
+    wanted = np.reshape(targets, (-1, 4, 4)) if are_poses(old, targets) else uncorrected.T
     names = tuple(labels) or tuple(str(i + 1) for i in range(len(wanted)))
     if not names or len(names) != len(wanted):
         raise DataError(
@@ -319,7 +318,7 @@ def _aim(
     posterior: Posterior | None, robot: Mechanism, targets: ArrayLike, wanted: FloatArray
 ) -> Solution:
     """Return the poses of the identified robot that the map of the residuals takes to targets."""
-    best, is_pose = inverse(robot, targets), np.shape(targets)[-2:] == (4, 4)
+    best, is_pose = inverse(robot, targets), are_poses(robot, targets)
     for _ in range(MAP_STEPS):
         if (twists := _correct(posterior, best)) is None:
             break

@@ -524,11 +524,7 @@ def inverse(robot: Mechanism, target: ArrayLike, start: Solution | None = None) 
     shapes = f"(n, 4, 4) poses or (n, {c}) coordinates ({', '.join(robot.controlled)})"
     wanted = np.asarray(target, dtype=float)
     values = robot.values[None]
-    is_pose = wanted.ndim >= 2 and wanted.shape[-2:] == (4, 4)
-    if wanted.ndim == 2 and c == 4 and is_pose:
-        # one pose, or four targets in four coordinates
-        is_pose = bool(np.array_equal(wanted[3], np.eye(4)[3]))
-    if is_pose:
+    if are_poses(robot, wanted):
         T = wanted.reshape(-1, 4, 4)
         _check_poses(T)
 
@@ -544,6 +540,16 @@ def inverse(robot: Mechanism, target: ArrayLike, start: Solution | None = None) 
     else:
         raise DataError(f"a target of shape {wanted.shape} was given; allowed are {shapes}")
     return make_solution(robot, state, compute_readings(robot, values, state)[0])
+
+
+def are_poses(robot: Mechanism, targets: ArrayLike) -> bool:
+    """Return whether targets of `inverse` are poses (.., 4, 4), and not four targets in four
+    coordinates.
+    """
+    shape = np.shape(targets)
+    if shape == (4, 4) and len(robot.controlled) == 4:
+        return np.array_equal(np.asarray(targets)[3], np.eye(4)[3])
+    return shape[-2:] == (4, 4)
 
 
 def make_solution(robot: Mechanism, state: State, q: FloatArray) -> Solution:
