@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import combinations
 
 import numpy as np
 
@@ -298,6 +299,9 @@ DRAWN = 1e-3
 WEAK = 1e-3
 """Singular value of the closures, relative to the largest, below which a step leaves it out [1]."""
 
+ACROSS = 0.1
+"""Smallest sine between two axes from which their common point is computed [1]."""
+
 NEAR, NEAR_RANGE = 4, 0.15
 """Number of poses near a pose, and range of their motors [rad, sizes]."""
 
@@ -533,6 +537,8 @@ def _align_axes(graph: JointGraph, q: FloatArray, limit: float) -> tuple[JointGr
         aligned[joint] = _align(axes[joint], known, normals if joint.kind == "P" else [], limit)
         known.append(aligned[joint])
     tree = {joint.name: float(value) for joint, value in zip(graph.tree, q, strict=True)}
+    lines = {joint: (frames[joint][:3, 3], aligned[joint]) for joint in moving if joint.kind == "R"}
+    shifts = dict(zip(lines, _meet(np.array([*lines.values()]), limit * graph.size), strict=True))
 
     def move(joint: GraphJoint) -> GraphJoint:
         A, B = (graph.get_place(placement, body)[0] for body in (joint.body_a, joint.body_b))
@@ -541,6 +547,7 @@ def _align_axes(graph: JointGraph, q: FloatArray, limit: float) -> tuple[JointGr
             far[:3, 3] = frame[:3, 3]
             return replace(joint, T_b=geometry.invert_pose(B) @ far)
         frame[:3, :3] = turn_between(axes[joint], aligned[joint]) @ frame[:3, :3]
+        frame[:3, 3] += shifts.get(joint, 0.0)
         near = replace(joint, T_a=geometry.invert_pose(A) @ frame, T_b=np.eye(4))
         if joint in graph.tree:
             value = tree[joint.name]
@@ -559,6 +566,24 @@ def _align_axes(graph: JointGraph, q: FloatArray, limit: float) -> tuple[JointGr
     )
     turns = [np.linalg.norm(np.cross(axes[joint], aligned[joint])) for joint in moving]
     return turned, float(max(turns, default=0.0))
+
+
+def _meet(lines: FloatArray, limit: float) -> FloatArray:
+    """Return the shifts (n, 3) by which lines (n, 2, 3) of points and directions meet in the point
+    that most of them pass within a limit [m], at least three; zero for the others.
+    """
+    points, axes = lines[:, 0], lines[:, 1]
+    across = np.eye(3) - axes[:, :, None] * axes[:, None]
+    shifts, most = np.zeros(points.shape), 2
+    for i, k in combinations(range(len(lines)), 2):
+        if np.linalg.norm(np.cross(axes[i], axes[k])) > ACROSS:
+            pair = across[[i, k]]
+            center = np.linalg.solve(pair.sum(axis=0), np.einsum("nij,nj->i", pair, points[[i, k]]))
+            gaps = np.einsum("nij,nj->ni", across, center - points)
+            near = np.linalg.norm(gaps, axis=1) <= limit
+            if near.sum() > most:
+                shifts, most = gaps * near[:, None], int(near.sum())
+    return shifts
 
 
 def _align(

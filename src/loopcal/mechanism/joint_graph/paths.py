@@ -493,7 +493,8 @@ def _align_frame(paths: LimbPaths, T_body_frame: FloatArray) -> FloatArray:
     """Return a frame (4, 4) of the platform with only those angles at home that it can change: a
     robot file states no others.
     """
-    turns = [name in paths.freedoms for name in AXES[:3]]
+    moving = list_freedoms(paths.graph, paths.home, paths.platform, T_body_frame)
+    turns = [name in moving for name in AXES[:3]]
     place = paths.locate(paths.platform)
     angles = geometry.matrix_to_euler((place @ T_body_frame)[:3, :3], "xyz")
     if not any(turns) or np.abs(angles[np.logical_not(turns)]).max(initial=0.0) < ALONG:

@@ -200,6 +200,26 @@ def test_chains_of_coupled_joints_agree_with_their_drawing(
     check_written_back(tmp_path, text, robot, q, platform)
 
 
+def test_platform_that_is_drawn_upside_down_has_only_angles_that_it_can_change(tmp_path) -> None:
+    """The ball joint alone would tilt the second arm, the loop does not."""
+    ball = PIN.replace("rod2", "arm2").replace("rod1", "rod").replace('"revolute"', '"ball"')
+    ball = ball.replace('child_origin xyz="0.3', 'child_origin xyz="0.2')
+    text = f"{FOUR_BAR}{ball}{TRANSMISSION.format('motor')}</robot>"
+    flipped = text.replace('xyz="0.3 0 0" rpy="0 0 1.0"', f'xyz="0.3 0 0" rpy="{np.pi} 0 1.0"', 1)
+    assert flipped != text
+    q = np.linspace(-0.3, 0.3, 5)[:, None]
+    upright, robot = (read(tmp_path, one, platform="arm2")[1] for one in (text, flipped))
+    expected, found = forward(upright, q).T, forward(robot, q).T @ robot.tool
+    expected[:, :3, :3] *= [1.0, -1.0, -1.0]
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
+
+
+def test_a_five_bar_with_one_motor_is_refused_with_its_mobility(tmp_path) -> None:
+    text = FIVE_BAR.replace(MOTORS, TRANSMISSION.format("mot1"))
+    with pytest.raises(LoopcalError, match="1 motor cannot hold .* the mobility is 2; name more"):
+        read(tmp_path, text)
+
+
 def test_gears_between_passive_joints_take_a_freedom(tmp_path) -> None:
     """The elbows of a five-bar turn together: with one motor it is the one with two motors at
     readings where this is true.

@@ -73,6 +73,46 @@ def test_rounded_loops_are_closed_and_the_gap_is_stated(tmp_path, machine, digit
     assert exported.text == path.read_text()
 
 
+def test_axes_of_a_spherical_loop_that_almost_meet_are_made_to_meet(tmp_path) -> None:
+    rng = np.random.default_rng(4)
+    axes = [Rotation.from_euler("xy", angles).as_matrix() for angles in rng.uniform(0, 2, (4, 2))]
+    places = [make_pose(R, 0.1 * (i + 1) * R[:, 2]) for i, R in enumerate(axes)]
+    pairs = [("base_link", "a"), ("a", "platform"), ("base_link", "b")]
+    text = '<robot name="s">' + "".join(f'<link name="{n}"/>' for n in ("base_link", "a", "b"))
+    text += '<link name="platform"/><transmission name="t"><joint name="j1"/></transmission>'
+    text += '<link name="tip"/><joint name="tip_frame" type="fixed"><parent link="platform"/>'
+    text += '<child link="tip"/><origin xyz="0.01 0.02 0.03"/></joint>'
+    drawn = {"base_link": np.eye(4)}
+
+    def format_origin(T: np.ndarray, tag: str = "origin") -> str:
+        numbers = [*T[:3, 3], *Rotation.from_matrix(T[:3, :3]).as_euler("xyz")]
+        xyz, rpy = (" ".join(f"{v:.6f}" for v in part) for part in (numbers[:3], numbers[3:]))
+        return f'<{tag} xyz="{xyz}" rpy="{rpy}"/>'
+
+    for i, ((parent, child), T) in enumerate(zip(pairs, places, strict=False), 1):
+        text += (
+            f'<joint name="j{i}" type="revolute"><parent link="{parent}"/><child link="{child}"/>'
+        )
+        text += f'{format_origin(np.linalg.inv(drawn[parent]) @ T)}<axis xyz="0 0 1"/></joint>'
+        drawn[child] = T
+    ends = {
+        n: np.linalg.inv(drawn[link]) @ places[3]
+        for n, link in (("parent", "b"), ("child", "platform"))
+    }
+    text += '<constraint name="pin" type="revolute"><parent link="b"/><child link="platform"/>'
+    text += "".join(format_origin(T, f"{n}_origin") for n, T in ends.items())
+    path = tmp_path / "spherical.urdf"
+    path.write_text(text + '<parent_axis xyz="0 0 1"/></constraint></robot>')
+    imported, robot = read(path)
+    assert imported.findings[0].data["mobility"] == 1
+    assert "files.loops-rounded" in {finding.code for finding in imported.findings}
+    solution = forward(robot, np.linspace(-0.05, 0.2, 5)[:, None])
+    assert solution.converged.all()
+    np.testing.assert_allclose(
+        inverse(robot, solution.T).q[:, 0], np.linspace(-0.05, 0.2, 5), atol=1e-9
+    )
+
+
 def test_file_with_exact_numbers_is_not_repaired(tmp_path) -> None:
     imported = read(write(tmp_path, "table", None))[0]
     assert "files.loops-rounded" not in {finding.code for finding in imported.findings}

@@ -277,13 +277,17 @@ def read(tree: LinkTree, options: ImportOptions, what: str) -> Imported:
     head = format_head(path, what, family, options.name, ("m", "rad"), remark)
     text = head + format_yaml(describe_robot(mechanism, paths, frame))
     findings = (*tree.notes, *_report_structure(mechanism, paths, frame))
-    return Imported(text, None, findings, _doubt_closures(mechanism, paths))
+    return Imported(text, None, findings, _doubt_file(mechanism, paths))
 
 
-def _doubt_closures(mechanism: Linkage, paths: StagePaths) -> Finding | None:
-    """Return that rigid closures probably stand for pins, where motors exceed the mobility."""
+def _doubt_file(mechanism: Linkage, paths: StagePaths) -> Finding | None:
+    """Return that motors are missing, or that rigid closures probably stand for pins where motors
+    exceed the mobility.
+    """
     motors, mobility = len(paths.graph.motors), paths.motions.mobility
-    if not mechanism.rigid_closures or motors <= mobility:
+    if motors < mobility:
+        return report_finding("files.motors-missing", motors=motors, mobility=mobility)
+    if not mechanism.rigid_closures or motors == mobility:
         return None
     return report_finding(
         "files.closure-rigid", closures=mechanism.rigid_closures, motors=motors, mobility=mobility
