@@ -216,7 +216,7 @@ def test_platform_that_is_drawn_upside_down_has_only_angles_that_it_can_change(t
 
 def test_a_five_bar_with_one_motor_is_refused_with_its_mobility(tmp_path) -> None:
     text = FIVE_BAR.replace(MOTORS, TRANSMISSION.format("mot1"))
-    with pytest.raises(LoopcalError, match="1 motor cannot hold .* the mobility is 2; name more"):
+    with pytest.raises(LoopcalError, match=r"1 motor cannot hold .* the mobility is 2; name more"):
         read(tmp_path, text)
 
 
