@@ -175,7 +175,7 @@ def reduce_to_platform(
         return A, Q
     m, eliminated = len(program.freedoms), A.shape[-1] - len(program.freedoms)
     whole = np.concatenate([A[..., m:], A[..., :m], Q], axis=-1)
-    rows = np.linalg.qr(whole, mode="r")[..., eliminated:, eliminated:]
+    rows = np.asarray(np.linalg.qr(whole, mode="r"))[..., eliminated:, eliminated:]
     out = np.zeros((*A.shape[:2], A.shape[2] - eliminated, rows.shape[-1]))
     out[:, :, : rows.shape[2]] = rows
     return out[..., :m], out[..., m:]
