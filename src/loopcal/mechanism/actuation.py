@@ -30,7 +30,6 @@ from loopcal.mechanism.transmission import (
     differentiate_sums,
     distribute_readings,
     evaluate_references,
-    evaluate_sums,
     find_fixed_rows,
     invert_weights,
     joint_slopes,
@@ -78,25 +77,6 @@ def differentiate_transmissions(robot: Mechanism, values: FloatArray, q: FloatAr
         turns = differentiate_joints_by_readings(robot, values, q)
         return join_columns(joints[..., : len(robot.parameters)], turns)
     return joints
-
-
-class DrivenSums(NamedTuple):
-    """Displacements e (t | 1, d), sums (t | 1, n, a) of joint values [m, rad], and weights (t | 1,
-    a, J) of the joints in them, of a robot whose readings are fewer sums than its joints.
-    """
-
-    e: FloatArray
-    sums: FloatArray
-    weights: FloatArray
-
-
-def drive_sums(robot: Mechanism, values: FloatArray, q: FloatArray) -> DrivenSums:
-    """Return displacements and sums for values (t | 1, p) and readings q (t | 1, n, a)."""
-    e, tau = robot.slots(values)
-    weights = select_weights(tau, robot.slots.constants)
-    assert weights is not None
-    with np.errstate(invalid="ignore"):  # as in `drive_joints`
-        return DrivenSums(e, evaluate_sums(q, tau, robot.slots.constants), weights)
 
 
 @dataclass(frozen=True, eq=False)

@@ -263,11 +263,13 @@ class _Iterate:
     count: IntArray
 
     def take(self, rows: IntArray) -> _Iterate:
-        """Return some rows."""
-        return map_arrays(lambda a: a[rows], self)
+        """Return some rows, by their positions in ascending order."""
+        return self if len(rows) == len(self.u) else map_arrays(lambda a: a[rows], self)
 
     def put(self, rows: IntArray, new: _Iterate) -> _Iterate:
         """Return the same rows with some replaced."""
+        if len(rows) == len(self.u):
+            return new
 
         def replaced(old: np.ndarray, part: np.ndarray) -> np.ndarray:
             out = np.array(old)
@@ -360,7 +362,9 @@ class _Rows:
     moving: IntArray
 
     def select(self, rows: IntArray) -> _Rows:
-        """Return some rows."""
+        """Return some rows, by their positions in ascending order."""
+        if len(rows) == len(self.target):
+            return self
 
         def chosen(a: np.ndarray) -> np.ndarray:
             return a if len(a) == 1 else a[rows]
@@ -507,7 +511,7 @@ class _Rows:
                 status = np.where(end, np.int8(STALLED), np.int8(EXHAUSTED))
                 status[broken], status[arrived] = NOT_FINITE, CONVERGED
                 now = replace(now, status=status, count=np.full(len(end), count))
-                done = now if len(alive) == R else done.put(alive, now)
+                done = done.put(alive, now)
                 keep = np.flatnonzero(~end)
                 if not len(keep) or count == STEPS:
                     break

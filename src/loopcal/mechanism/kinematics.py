@@ -17,13 +17,7 @@ from numpy.typing import NDArray
 
 from loopcal import engine, geometry
 from loopcal.engine import State
-from loopcal.mechanism.actuation import (
-    ITERATIONS,
-    DrivenJoints,
-    drive_joints,
-    drive_sums,
-    solve_open_sums,
-)
+from loopcal.mechanism.actuation import ITERATIONS, DrivenJoints, drive_joints, solve_open_sums
 from loopcal.mechanism.chains import ChainState, each_stage, join_stage_states, locate_stage_bases
 from loopcal.mechanism.limb_rows import follow_limb
 from loopcal.mechanism.model import Mechanism
@@ -32,6 +26,7 @@ from loopcal.mechanism.transmission import (
     ALL_TERMS,
     TERMS,
     apply_weights,
+    evaluate_sums,
     find_triangles,
     invert_weights,
     measure_excess,
@@ -128,6 +123,18 @@ class Loops(NamedTuple):
         return Loops(self.robot, take(self.e), weights)
 
 
+def drive_loops(robot: Mechanism, values: FloatArray, q: FloatArray) -> tuple[Loops, FloatArray]:
+    """Return the loops of a robot without stages for values (t | 1, p), and its driven joints or
+    open sums (t | 1, n, a) [m, rad] at readings q (t | 1, n, a).
+    """
+    loops = Loops.place(robot, values)
+    if not robot.has_open_sums:
+        return loops, drive_joints(robot, values, q).joints
+    _, tau = robot.slots(values)
+    with np.errstate(invalid="ignore"):  # as in `drive_joints`
+        return loops, evaluate_sums(q, tau, robot.slots.constants)
+
+
 def follow_path(
     loops: Loops, joints: FloatArray, begin: State, state: State, wrong: BoolArray
 ) -> State:
@@ -217,8 +224,8 @@ def forward_trials(
         ]
         return join_stage_states(robot, states)
     if robot.has_open_sums:
-        e, sums, weights = drive_sums(robot, values, q)
-        return close_at_joints(robot, e, sums, start, follow, weights=weights)
+        loops, sums = drive_loops(robot, values, q)
+        return close_at_joints(robot, loops.e, sums, start, follow, weights=loops.weights)
     e, tau, joints = driven or drive_joints(robot, values, q)
     state = close_at_joints(robot, e, joints, start, follow, goal)
     if not len(find_triangles(tau)):
@@ -303,13 +310,10 @@ def close_loops(
             for own in each_stage(robot, values, begin, q)
         ]
         return join_stage_states(robot, states)
-    if robot.has_open_sums:
-        e, sums, weights = drive_sums(robot, values, q)
-        return Loops(robot, e, weights).solve(sums, begin, None, max_iterations)
-    e, _, joints = drive_joints(robot, values, q)
+    loops, driven = drive_loops(robot, values, q)
     if robot.is_serial:
-        return solve_serial(robot, e, joints, begin.T.shape[:2])
-    return Loops(robot, e, None).solve(joints, begin, None, max_iterations)
+        return solve_serial(robot, loops.e, driven, begin.T.shape[:2])
+    return loops.solve(driven, begin, None, max_iterations)
 
 
 def find_directly_reachable(robot: Mechanism, values: FloatArray, q: FloatArray) -> BoolArray:

@@ -230,6 +230,8 @@ def place_links(group: Group, k: int, displacements: FloatArray) -> tuple[FloatA
     (t, J) of its joints, for its displacements (t, s).
     """
     move, pitch = sum_displacements(group, k, displacements)
+    if not move.any():  # at nominal values
+        return np.broadcast_to(group.links[k], (len(move), *group.links[k].shape)), pitch
     displaced = geometry.make_pose(geometry.exp_so3(move[..., :3]), move[..., 3:])
     return group.links[k] @ displaced, pitch
 
