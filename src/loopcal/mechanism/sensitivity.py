@@ -202,7 +202,7 @@ def differentiate_passive_joints(
     twists = np.concatenate(platform, axis=3)[:, :, freedoms]
     driven = differentiate_driven_joints(robot, values, q, state)
     by_inputs = move_passive_joints(robot, values, state, twists, driven)
-    if robot.program.may_stay_open and not robot.has_sums:
+    if robot.program.may_stay_open and not robot.has_open_sums:
         places, exact = _differentiate_open_joints(robot, values, q, state, names)
         by_inputs[:, :, places] = exact
     by_inputs[~is_closed(state.status)] = np.nan
@@ -220,6 +220,10 @@ def _differentiate_open_joints(
     joints = joints_from_readings(q, tau, robot.slots.constants)
     inputs = robot.all_parameters.linearize(values, tau, q)
     exact = differentiate_unknowns(program, e, joints, state, inputs)
+    if robot.has_sums:
+        own, by_joints = np.split(exact, [len(robot.parameters)], axis=-1)
+        turns = differentiate_joints_by_readings(robot, values, q)
+        exact = np.concatenate([own, by_joints @ turns], axis=-1)
     places = [
         names.index(f"{limbs[i].name}.{limbs[i].joints[j].name}")
         for i, j in list_unknown_joints(program)

@@ -338,3 +338,56 @@ stages:
 def test_the_check_of_a_robot_lists_its_couplings(name, capsys):
     assert main(["check", name, "--expand"]) == 0
     assert "what couplings hold" in capsys.readouterr().out
+
+
+def write_arm(name: str, x: float, more: str = "") -> str:
+    """Return one of three parallel arms of a loop that is closed for exact geometry only."""
+    return (
+        f"  - {{name: {name}, {more}tip: [100, 0, 0], ending: ball, attach: [{x - 100}, 0, 0], "
+        f"chain: [{{joint: R, name: pin, at: [{x}, 0, 0], start: 70, actuated: {name}}}], "
+        "errors: [{of: tip, shift: [x], tolerance: {sd: 0.1}}]}\n"
+    )
+
+
+OPEN = f"{HEAD}name: arms\nclosure: least-squares\nfreedoms: [x, y, rz]\ncontrolled: [x]\n"
+BELT = f"""{OPEN}drives: {{a: {{reads: angle, unknown: [offset], angle: {{sd: 0.3}}}}}}
+couplings:
+  belt: {{sum: {{a: 1, b.pin: -1}}, unknown: [offset, weight.a], angle: {{sd: 0.01}},
+    weights: {{sd: 0.0001}}}}
+limbs:
+{write_arm("a", 0)}{write_arm("b", 100)}{write_arm("c", 200)}\
+home: {{x: 134.2020143, y: 93.96926208}}
+workspace: {{x: [100, 150]}}
+""".replace(", actuated: b", "").replace(", actuated: c", "")
+ON_CAR = "".join(write_arm(n, x, "on: car, ") for n, x in zip("abc", (0, 100, 200), strict=True))
+PINION = (
+    f"""{OPEN}drives: {{rod: {{reads: length, unknown: [offset], length: {{sd: 0.1}}}}}}
+bodies: [{{name: car}}]
+couplings:
+  rack: {{of: length, sum: {{s.way: 1}}, radius: {{a.pin: 30}}, offset: 36.65,
+    unknown: [offset, radius], length: {{sd: 0.01}}, radii: {{sd: 0.01}}}}
+limbs:
+  - {{name: s, to: car, ending: rigid, chain: [{{joint: P, name: way, axis: x}}]}}
+{ON_CAR}  - {{name: r, tip: [250, 0, 0], ending: distance, actuated: rod}}
+home: {{x: 134.2020143, y: 93.96926208}}
+workspace: {{x: [100, 150]}}
+""".replace(", actuated: a}", "}")
+    .replace(", actuated: b}", "}")
+    .replace(", actuated: c}", "}")
+)
+
+
+@pytest.mark.parametrize(("text", "share"), [(BELT, 1e-6), (PINION, 1e-3)])
+def test_derivatives_of_loops_that_stay_open_between_gears(tmp_path, text, share) -> None:
+    """Where closure determines coupled joints, terms of the gap over the size are neglected."""
+    robot = draw_errors(load_text(tmp_path, text), 1)
+    solved = forward(robot, inverse(robot.nominal, np.array([[0.12], [0.134], [0.14]])).q)
+    assert 1e-5 < solved.residual.max() < 1e-4  # [m]: the loops stay open
+    values, q = robot.values[None], solved.q[None]
+    names, *_ = sensed = differentiate_passive_joints(robot, values, q, solved.state)
+    assert names == solved.passive_names
+    for p, step in enumerate(1e-6 * np.eye(len(robot.values))):
+        up, down = (forward(robot.with_values(robot.values + s), solved.q, start=solved).passive
+                    for s in (step, -step))  # fmt: skip
+        slope = (up - down) / 2e-6
+        assert np.abs(slope - sensed.parameters[0, ..., p]).max() < share * np.abs(slope).max()
