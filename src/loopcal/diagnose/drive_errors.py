@@ -6,7 +6,7 @@ whitened rows, with their derivatives by the readings as columns, which are zero
 the pose of a row (`numerics.statistics.Remainder`). Backlash is an error
 of the sign of travel from the pose before: a linear effect, see `residual_patterns`.
 Sources: Patterson and Thompson, Recovery of inter-block information when block sizes are unequal,
-Biometrika 58 (1971); docs/theory/uncertainty.md.
+Biometrika 58 (1971); docs/theory/residual-patterns.md.
 """
 
 from __future__ import annotations

@@ -9,7 +9,7 @@ sigma^2 + tau^2 S S'. The test compares residuals by their weights alone: it nee
 does not depend on the order of the poses. Displacements and rotations of the tool are tested one
 after the other, the more significant first. Only directions that the rows sense have errors, each
 as large as its own residuals show. The likelihood chooses over which length the errors vary. See
-docs/theory/uncertainty.md.
+docs/theory/residual-patterns.md.
 
 The lack of fit is tested against the pure error of repeated poses, which have equal predictions:
 SS_pure = sum over groups min over mu of |W (r - mu)|^2, SS_lack = RSS - SS_pure, and SS_lack /

@@ -6,7 +6,7 @@ the information M = sum_j w_j A_j'A_j + P (P the penalty) and G = A_j M^-1 A_j' 
 the squared Mahalanobis norm of the residual that block j has with respect to a fit without it is
 d^2 = sum r^2 / ((1 - w g)(1 + (1 - w) g)) in the eigenvectors of G. If block and model are right it
 is a chi-square with as many degrees of freedom as there are directions with 1 - w g > 0. The
-leverage is the trace of w G. See docs/theory/uncertainty.md.
+leverage is the trace of w G. See docs/theory/residual-patterns.md.
 
 A block is an outlier where the probability of its distance is below 1 - (1 - level)^(1/u), u blocks
 tested (Sidak). Several wrong blocks hide each other: suspects are excluded until the same ones are
