@@ -188,8 +188,10 @@ def _halve_sigma(
         number, rows = list(of_rows).index(named), []
         for of_kind, own in zip(problem.rows, members, strict=True):
             root = find_share(own, number)
-            left, axes = np.linalg.eigh(np.eye(root.shape[1]) - 0.75 * root.mT @ root)
-            factor = axes / np.sqrt(left)[:, None, :] @ axes.mT
+            left, axes = np.linalg.eigh(
+                np.eye(root.shape[1]) - 0.75 * np.swapaxes(root, 1, 2) @ root
+            )
+            factor = axes / np.sqrt(left)[:, None, :] @ np.swapaxes(axes, 1, 2)
             whitener = of_kind.whitener
             whitener = factor * whitener if root.shape[1] == 1 else factor @ whitener
             rows.append(replace(of_kind, whitener=whitener))

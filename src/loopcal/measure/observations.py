@@ -391,20 +391,23 @@ class Observations:
         """Return name, stated size and root (r, m, m) of each part of the noise. Whitened rows
         times the roots have unit noise in sum; the root is None where one part is all.
         """
-        rest = self.covariance - sum(part.covariance for part in self.noise_parts)
-        variance = np.einsum("rii->ri", self.covariance)[:, :, None]
         if not self.noise_parts:
             sd = np.sqrt(np.einsum("rii->ri", self.covariance)[self.present])
             return [("", find_size(sd, {c.dimension for c in self.kind.noise_columns}), None)]
         parts = list(self.noise_parts)
+        rest = self.covariance - sum(part.covariance for part in parts)
+        variance = np.einsum("rii->ri", self.covariance)[:, :, None]
         if np.any(np.abs(rest) > ROUNDING * np.where(self.present[:, :, None], variance, np.inf)):
             parts.append(NoisePart("", rest))
+        if len(parts) == 1:
+            return [(parts[0].name, parts[0].size, None)]
         weight = np.where(self.weight > 0.0, self.weight, np.inf)[:, None, None]
         split = []
         for part in parts:
             inner = np.where(self.present[:, :, None], part.covariance, 0.0)
-            share, axes = np.linalg.eigh(self.whitener @ inner @ self.whitener.mT / weight)
-            root = np.sqrt(np.maximum(share, 0.0))[:, :, None] * axes.mT
+            whitened = self.whitener @ inner @ np.swapaxes(self.whitener, 1, 2)
+            share, axes = np.linalg.eigh(whitened / weight)
+            root = np.sqrt(np.maximum(share, 0.0))[:, :, None] * np.swapaxes(axes, 1, 2)
             split.append((part.name, part.size, root))
         return split
 

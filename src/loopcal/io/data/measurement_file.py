@@ -683,7 +683,9 @@ def _build_instrument(table: Table, kinds: Sequence[KindRows]) -> Instrument:
         for column in entry.kind.noise_columns:
             if column.name not in entry.noise:
                 example = f"noise: {{{column.name}: {EXAMPLES[column.dimension]}}}"
-                sentence = f"the settings state no noise of {column.name!r}; add '{example}'"
+                sentence = (
+                    f"planning and simulation need the noise of {column.name!r}; add '{example}'"
+                )
                 raise table.settings.error(sentence, (*entry.location, "noise"))
         sigma = np.array([entry.noise[column.name] for column in entry.kind.noise_columns])
         sensors.append(Sensor(entry.kind, Gaussian(sigma)))

@@ -533,6 +533,8 @@ def describe_controllers(record: CalibrationRecord) -> Iterator[Element]:
         return
     if not record.controllers:
         yield NO_CONTROLLER
+    noted = [note for values in record.controllers for note in values.notes]
+    of_all = {note for note in noted if 1 < noted.count(note) == len(record.controllers)}
     for values in record.controllers:
         lines = values.text.strip("\n").splitlines()
         if len(lines) <= LINES:
@@ -542,8 +544,10 @@ def describe_controllers(record: CalibrationRecord) -> Iterator[Element]:
                 f"{values.format} ({values.what}): {len(lines)} lines, too many for this page; the "
                 "command loopcal export writes them to a file."
             )
-        if values.notes:
-            yield Listing(tuple(("note", note) for note in values.notes))
+        if notes := tuple(("note", note) for note in values.notes if note not in of_all):
+            yield Listing(notes)
+    if of_all:
+        yield Listing(tuple(("note", note) for note in sorted(of_all)))
     yield EVERYWHERE
 
 
