@@ -38,7 +38,7 @@ Array = NDArray[np.float64]
 MM = 1e-3
 
 RELATIVES = {
-    "3-rps", "6-pus", "cable-4", "cable-camera", "hexapod-nategh-agheli", "hexapod-octahedral",
+    "3-rps", "6-pus", "cable-4", "cable-camera", "hexapod-elastic", "hexapod-nategh-agheli", "hexapod-octahedral",
     "klann-leg", "linear-delta-6", "orthoglide", "palletizer", "par4", "pulley-3", "rotary-delta",
     "solar-tracker", "telescopic-delta", "tricept", "warm-delta",
 }  # fmt: skip

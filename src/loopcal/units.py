@@ -26,6 +26,18 @@ class Dimension(Enum):
     RATIO = "ratio"
     TEMPERATURE = "temperature"
     TIME = "time"
+    FORCE = "force"
+    MOMENT = "moment"
+    LENGTH_PER_TEMPERATURE = "length per temperature"
+    LENGTH_PER_TIME = "length per time"
+    LENGTH_PER_FORCE = "length per force"
+    ANGLE_PER_TEMPERATURE = "angle per temperature"
+    ANGLE_PER_TIME = "angle per time"
+    ANGLE_PER_MOMENT = "angle per moment"
+
+    def per(self, other: Dimension) -> Dimension:
+        """Return the dimension of a slope: that of a length or angle per unit of another one."""
+        return Dimension(f"{self.value} per {other.value}")
 
 
 LARGEST = 1e9
@@ -52,7 +64,7 @@ class Unit:
         return self.symbol
 
 
-UNITS: Mapping[str, Unit] = {
+UNITS: dict[str, Unit] = {
     u.symbol: u
     for u in (
         Unit("m", Dimension.LENGTH, 1.0),
@@ -71,24 +83,51 @@ UNITS: Mapping[str, Unit] = {
         Unit("um/m", Dimension.RATIO, 1e-6),
         Unit("degC", Dimension.TEMPERATURE, 1.0),
         Unit("s", Dimension.TIME, 1.0),
+        Unit("N", Dimension.FORCE, 1.0),
+        Unit("kN", Dimension.FORCE, 1e3),
+        Unit("lbf", Dimension.FORCE, 4.4482216152605),
+        Unit("Nm", Dimension.MOMENT, 1.0),
+        Unit("kNm", Dimension.MOMENT, 1e3),
     )
 }
+SLOPES = {"degC": ("m", "rad"), "s": ("m", "rad"), "N": ("m",), "Nm": ("rad",)}
+"""What slopes are per unit of -> the units of these slopes in SI."""
 
-SI_SYMBOLS: Mapping[Dimension, str] = {
+
+def _make_slope(of: str, by: str) -> Unit:
+    unit = UNITS[of]
+    return Unit(f"{of}/{by}", unit.dimension.per(UNITS[by].dimension), unit.factor_to_si)
+
+
+UNITS |= {
+    f"{prefix}{of}/{by}": _make_slope(prefix + of, by)
+    for by, all_of in SLOPES.items()
+    for of in all_of
+    for prefix in ("", "m", "u")
+}
+SI_SYMBOLS: dict[Dimension, str] = {
     Dimension.LENGTH: "m",
     Dimension.ANGLE: "rad",
     Dimension.RATIO: "1",
     Dimension.TEMPERATURE: "degC",
     Dimension.TIME: "s",
+    Dimension.FORCE: "N",
+    Dimension.MOMENT: "Nm",
 }
+SI_SYMBOLS |= {UNITS[f"{of}/{by}"].dimension: f"{of}/{by}" for by in SLOPES for of in SLOPES[by]}
 
 # Units of tables if the robot file states no others.
-DISPLAY_UNITS: Mapping[Dimension, Unit] = {
+DISPLAY_UNITS: dict[Dimension, Unit] = {
     Dimension.LENGTH: UNITS["mm"],
     Dimension.ANGLE: UNITS["deg"],
     Dimension.RATIO: UNITS["1"],
     Dimension.TEMPERATURE: UNITS["degC"],
     Dimension.TIME: UNITS["s"],
+    Dimension.FORCE: UNITS["N"],
+    Dimension.MOMENT: UNITS["Nm"],
+}
+DISPLAY_UNITS |= {
+    unit.dimension: unit for unit in UNITS.values() if re.match("u(m|rad)/[^m]", unit.symbol)
 }
 
 # Examples of quantities, for messages.
@@ -98,12 +137,15 @@ EXAMPLES: Mapping[Dimension, str] = {
     Dimension.RATIO: "1.5 1",
     Dimension.TEMPERATURE: "21.5degC",
     Dimension.TIME: "60s",
+    Dimension.FORCE: "500N",
+    Dimension.MOMENT: "20Nm",
 }
 
 
 def list_symbols(dimension: Dimension | None = None) -> tuple[str, ...]:
-    """Return the allowed unit symbols, of one dimension or of all."""
-    return tuple(s for s, u in UNITS.items() if dimension is None or u.dimension is dimension)
+    """Return the allowed unit symbols, of one dimension or of all but slopes."""
+    of = [d for d in Dimension if " per " not in d.value] if dimension is None else [dimension]
+    return tuple(s for s, u in UNITS.items() if u.dimension in of)
 
 
 ARTICLES = {
@@ -130,9 +172,10 @@ def find_unit(symbol: str, dimension: Dimension | None = None) -> Unit:
             f"{', '.join(allowed)}"
         )
     if dimension is not None and known.dimension is not dimension:
+        needed = ARTICLES.get(dimension, f"a {dimension.value}")
         raise UnitError(
-            f"{symbol!r} is a unit of {known.dimension.value}, but {ARTICLES[dimension]} is "
-            f"needed; allowed are {', '.join(allowed)}"
+            f"{symbol!r} is a unit of {known.dimension.value}, but {needed} is needed; "
+            f"allowed are {', '.join(allowed)}"
         )
     return known
 

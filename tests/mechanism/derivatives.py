@@ -27,7 +27,8 @@ def check_pose_derivatives(machine: Mechanism, q: np.ndarray) -> None:
         return geometry.pose_difference(moved.T, state.T[0])
 
     # the difference of two rotations is a logarithm, whose slope at zero is the angular velocity
-    unit = {Dimension.LENGTH: 0.02 * machine.size}
+    unit = {Dimension.LENGTH: 0.02 * machine.size, Dimension.FORCE: 50.0}
+    unit |= {Dimension.LENGTH_PER_FORCE: 1e-4 * machine.size, Dimension.ANGLE_PER_MOMENT: 1e-4}
     zero = np.zeros(len(machine.actuators))
     for function, slopes, start, dimensions in (
         (by_value, known.parameters, values, machine.parameters.dimensions),

@@ -32,7 +32,7 @@ from loopcal.mechanism.assembly import AXES, TWIST_UNITS
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import list_dimensions, read_coordinates
 from loopcal.mechanism.sensitivity import differentiate_pose
-from loopcal.mechanism.solutions import Solution, are_poses, forward, inverse
+from loopcal.mechanism.solutions import Solution, are_poses, forward, inverse, list_commanded
 from loopcal.mechanism.states import Status
 from loopcal.mechanism.workspace import check_limits
 from loopcal.results.description import Field, fields, label_axes
@@ -185,6 +185,7 @@ def compensate(
     progress: Progress = report_no_progress,
     frame: str = FITTED,
     residual_map: bool = False,
+    conditions: Mapping[str, float] | None = None,
 ) -> Compensation:
     """Compute readings or shifted commands for targets.
 
@@ -198,6 +199,8 @@ def compensate(
     labels : of the targets; default "1", "2", ... progress : receives the passes that are done.
     frame : of the uncertainty, see `pose_uncertainty`; "relative": to the first target.
     residual_map : whether a smooth map of the residuals of the fit corrects the poses as well.
+    conditions : today's temperatures and load, see `Mechanism.with_conditions`. The controller does
+        not know them.
 
     Returns
     -------
@@ -216,6 +219,9 @@ def compensate(
     source = fit.posterior if isinstance(fit, Identification) else fit
     robot, posterior = (source, None) if isinstance(source, Mechanism) else (source.robot, source)
     old = controller or robot.nominal
+    if conditions:
+        robot = robot.with_conditions(conditions)
+        posterior = None if posterior is None else replace(posterior, robot=robot)
     gain = None
     if residual_map:
         gain, posterior = _use_map(posterior)
@@ -232,7 +238,7 @@ def compensate(
     count.begin(TASK)
     best = _aim(posterior, robot, targets, wanted)
     count.begin(TASK)
-    unchanged = forward(robot, uncorrected.q)
+    unchanged = _follow(robot, old, uncorrected)
     before = geometry.pose_difference(_predict(posterior, unchanged), wanted)
     final, commands, distances = best, None, np.zeros((1, len(wanted), 6))
     if mode == "commands":
@@ -274,6 +280,11 @@ def compensate(
         findings=findings,
         residual_map=gain,
     )
+
+
+def _follow(robot: Mechanism, controller: Mechanism, commanded: Solution) -> Solution:
+    """Return where a robot is at the readings of its controller, at today's conditions."""
+    return forward(robot, commanded.q[:, list_commanded(controller)])
 
 
 def _use_map(posterior: Posterior | None) -> tuple[Finding, Posterior]:
@@ -337,7 +348,7 @@ def _remove_unfixed_frames(
     if frame != FITTED or not frames.motions.shape[1]:
         return errors
     commanded = inverse(controller, frames.poses)
-    reached = forward(posterior.robot, commanded.q)
+    reached = _follow(posterior.robot, controller, commanded)
     if not (commanded.converged & reached.converged).all():
         return errors
     reference = geometry.pose_difference(reached.T, frames.poses)
@@ -359,14 +370,14 @@ def _shift_commands(
     """
     solution = uncorrected
     commands = read_coordinates(solution.T, controller.controlled)
-    final = forward(robot, solution.q)
+    final = _follow(robot, controller, solution)
     distances = [geometry.pose_difference(final.T, best.T)]
     for _ in range(steps):
         count.begin(TASK)
         moved = geometry.apply_twist(solution.T, -distances[-1])
         commands = read_coordinates(moved, controller.controlled)
         solution = inverse(controller, commands, solution if solution.converged.all() else None)
-        final = forward(robot, solution.q)
+        final = _follow(robot, controller, solution)
         distances.append(geometry.pose_difference(final.T, best.T))
     return final, commands, np.stack(distances)
 

@@ -26,7 +26,7 @@ import loopcal as lc
 from loopcal.cli import terminal
 from loopcal.errors import DataError, LoopcalError, UnitError, suggest_names
 from loopcal.registry import Registry
-from loopcal.units import Dimension, find_unit, parse_quantity
+from loopcal.units import Dimension, find_unit, parse_number, parse_quantity
 
 if TYPE_CHECKING:
     from click.shell_completion import CompletionItem
@@ -207,6 +207,16 @@ def _parse_goal(text: str) -> tuple[float, str]:
         raise UnitError(f"{error}; or give an angle, such as 10urad") from None
 
 
+def _parse_condition(text: str) -> tuple[str, float]:
+    """Return the name of a condition and its value [degC, s, N, Nm]."""
+    name, _, value = text.partition("=")
+    dimension = {d.value: d for d in Dimension}.get(name.partition(".")[0])
+    if dimension is None or not value:
+        raise UnitError(f"{text!r} is no condition; write temperature=35 or force.z=-500N")
+    number = parse_number(value)
+    return name, parse_quantity(value, dimension) if number is None else number
+
+
 def _parse_pose_share(text: str) -> float:
     """Return a share of the poses, from 0 to below 1; an error says what was probably meant."""
     from loopcal.apply.calibration_options import describe_wrong_share
@@ -227,6 +237,7 @@ LENGTH, POSITIVE_LENGTH = (_quantity(Dimension.LENGTH, positive) for positive in
 ANGLE, POSITIVE_ANGLE = (_quantity(Dimension.ANGLE, positive) for positive in (False, True))
 GOAL = Parsed("quantity", _parse_goal)
 NAMES = Parsed("names", lambda text: tuple(text.split(",")), ",".join)
+CONDITION = Parsed("condition", _parse_condition)
 POSE_SHARE = Parsed("share", _parse_pose_share)
 SHARE, OPEN_SHARE = (click.FloatRange(0, 1, is_open, is_open) for is_open in (False, True))
 SHARE.name = OPEN_SHARE.name = "share"
@@ -325,6 +336,13 @@ def data_option(help: str, **settings: Any) -> Any:  # noqa: A002
 
 ROBOT: Any = argument("ROBOT", shell_complete=complete_robot)
 RUN: Any = argument("RUN", type=FILE)
+AT: Any = option(
+    "Today's value of a condition of the robot file, such as temperature=35 or force.z=-500N. May "
+    "be given several times.",
+    multiple=True,
+    type=CONDITION,
+    metavar="NAME=VALUE",
+)
 VERBOSE: Any = flag("Print all findings and tables, not only the summary.", "-v")
 
 

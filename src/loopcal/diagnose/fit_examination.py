@@ -33,7 +33,7 @@ from loopcal.findings import Finding, report_finding
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations
 from loopcal.mechanism.model import Mechanism
-from loopcal.mechanism.transmission import transmit_readings
+from loopcal.mechanism.transmission import SOURCE, find_fixed_rows, transmit_readings
 from loopcal.numerics.statistics import compute_f_tail, find_distinct
 from loopcal.results.description import Field, fields
 from loopcal.results.result import Result
@@ -273,11 +273,12 @@ def compute_reading_errors(
     compared = np.isfinite(sigma) & (sigma > 0.0) & np.isfinite(recorded) & np.isfinite(estimated)
     reading = np.where(compared, recorded - estimated, np.nan)
     _, tau = robot.slots(robot.values[None])
-    # values (n, a) of the driven joints, or of their sums
-    joint_values = [
-        transmit_readings(q[None], tau, robot.slots.constants)[0] for q in (recorded, estimated)
-    ]
-    joint = np.where(compared, joint_values[0] - joint_values[1], np.nan)
+    # values of the driven joints, or of their sums; a condition has none
+    constants, joint = robot.slots.constants, np.full_like(reading, np.nan)
+    own = ~find_fixed_rows(constants)
+    values = [transmit_readings(q[None], tau, constants)[0][:, own] for q in (recorded, estimated)]
+    joint[:, constants[own, SOURCE].astype(int)] = values[0] - values[1]
+    joint[~compared] = np.nan
     limbs = robot.assembly.limbs
     turning = {joint.actuator for limb in limbs for joint in limb.joints if joint.kind == "R"}
     dimensions = [
@@ -286,7 +287,7 @@ def compute_reading_errors(
     ]
     errors = []
     for i, actuator in enumerate(robot.actuators):
-        if not compared[:, i].any():
+        if not np.isfinite(joint[:, i]).any():
             continue
         worst = int(np.nanargmax(np.abs(joint[:, i])))
         errors.append(

@@ -145,7 +145,11 @@ def select_free_parameters(robot: Mechanism) -> FreeParameters:
     assumed = np.isnan(stated)
     tolerance = stated
     if assumed.any():
-        default = {Dimension.LENGTH: DEFAULT_TOLERANCE * robot.size}
+        lengths = (
+            Dimension.LENGTH,
+            *map(Dimension.LENGTH.per, (Dimension.TEMPERATURE, Dimension.TIME)),
+        )
+        default = dict.fromkeys(lengths, DEFAULT_TOLERANCE * robot.size)
         dimensions = table.dimensions
         fallback = np.array([default.get(dimensions[i], DEFAULT_TOLERANCE) for i in places])
         tolerance = np.where(assumed, fallback, stated)

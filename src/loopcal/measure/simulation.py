@@ -34,7 +34,8 @@ from loopcal.measure.readings import (
     solve_commanded_poses,
 )
 from loopcal.mechanism.actuation import solve_at_pose
-from loopcal.mechanism.kinematics import forward_trials
+from loopcal.mechanism.assembly import FORCES
+from loopcal.mechanism.kinematics import forward_trials, load_readings
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.over_constraint import refuse_drawn_errors
 from loopcal.mechanism.platform_coordinates import POSITION, read_coordinates
@@ -303,7 +304,12 @@ def _draw_conditions(robot: Mechanism, readings: FloatArray, seed: Seed) -> Floa
     for i, actuator in enumerate(robot.actuators):
         if actuator.reference is not None and actuator.stroke is not None:
             out[:, i] = stream.uniform(*actuator.stroke, len(out))
-    return out
+    if not robot.is_elastic:
+        return out
+    load, wrench = robot.assembly.load, np.tile(robot.assembly.load.wrench, (len(out), 1))
+    for name, ends in load.ranges.items():
+        wrench[:, FORCES.index(name)] = stream.uniform(*ends, len(out))
+    return load_readings(robot, robot.values[None], out[None], wrench)[0]
 
 
 def _draw_setup(

@@ -27,12 +27,11 @@ from loopcal.mechanism.model import Mechanism, ParameterUnits
 from loopcal.mechanism.states import driven_values
 from loopcal.mechanism.transmission import (
     apply_weights,
+    differentiate_by_readings,
     differentiate_sums,
-    distribute_readings,
     evaluate_references,
     find_fixed_rows,
     invert_weights,
-    joint_slopes,
     joints_from_readings,
     readings_from_joints,
     select_weights,
@@ -310,8 +309,7 @@ def differentiate_joints_by_readings(
     _, tau = robot.slots(values)
     weights = select_weights(tau, robot.slots.constants)
     assert weights is not None
-    slopes = joint_slopes(q, tau, robot.slots.constants)
-    by_readings = distribute_readings(slopes, robot.slots.constants)
+    by_readings = differentiate_by_readings(q, tau, robot.slots.constants)
     return np.matmul(invert_weights(weights)[:, None], by_readings)
 
 
@@ -328,8 +326,7 @@ def _differentiate_sums(
     of_terms = slots.jacobian(values)[:, slots.n_displacements :]
     of_terms = of_terms.reshape(len(of_terms), *slots.terms.shape, -1)
     by_parameters = np.moveaxis(np.matmul(np.moveaxis(by_terms, 2, 1), of_terms), 1, 2)
-    slopes = joint_slopes(q, tau, slots.constants)
-    by_readings = distribute_readings(slopes, slots.constants)
+    by_readings = differentiate_by_readings(q, tau, slots.constants)
     shapes = by_parameters.shape[:2], by_readings.shape[:2], lengths.shape[:2]
     lead = np.broadcast_shapes(*shapes)
     both = (np.broadcast_to(a, (*lead, *a.shape[2:])) for a in (by_parameters, by_readings))

@@ -161,6 +161,7 @@ class Actuator:
         [m or rad].
     terms : nominal transmission from reading to joint value, by name of the term; without terms
         the joint value is the reading.
+        A drive with a `compliance` [m/N, rad/Nm] has its load as a condition.
     period : reading per turn of the source of the harmonics [m or rad], 0 for none.
     sigma : standard deviation of the reading, weighs redundant readings [m or rad].
     weights : of a summed drive, by the name of a driven joint: the transmission gives the sum of
@@ -198,6 +199,27 @@ class Actuator:
         return "side" in self.terms
 
 
+@dataclass(frozen=True)
+class Load:
+    """What acts on the platform from outside.
+
+    wrench : force [N] and moment [Nm], FORCES. ranges : of these, from which simulations draw.
+    stated : components that the robot file names, so that measurement files have them.
+    of_platform : whether their axes are those of the platform, not those of the base. at : where
+        the force acts and about what the moment is, in the platform [m].
+    """
+
+    wrench: tuple[float, ...] = (0.0,) * 6
+    ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict, hash=False)
+    stated: tuple[str, ...] = ()
+    of_platform: bool = False
+    at: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+FORCES = tuple(f"{what}.{axis}" for what in ("force", "moment") for axis in "xyz")
+"""Names of the components of a wrench."""
+
+
 @dataclass(frozen=True, eq=False)
 class Assembly:
     """A mechanism as the `expand` method of a family returns it.
@@ -218,6 +240,7 @@ class Assembly:
         platform that limbs join. They have the freedoms of the platform.
     held : of a chain, the actuators that inverse kinematics leaves at their present readings.
     couplings : rows of driven joints beside those of actuators, without a reading of their own.
+    load : on the end platform.
     """
 
     name: str
@@ -239,6 +262,7 @@ class Assembly:
     bodies: Mapping[str, FloatArray] = field(default_factory=dict)
     held: tuple[str, ...] = ()
     couplings: tuple[Actuator, ...] = ()
+    load: Load = field(default_factory=Load)
 
     @cached_property
     def rows(self) -> tuple[Actuator, ...]:

@@ -44,6 +44,7 @@ from loopcal.mechanism.platform_coordinates import compare_coordinates, read_coo
 from loopcal.mechanism.sensitivity import differentiate_pose
 from loopcal.mechanism.states import driven_values, is_closed, make_start
 from loopcal.mechanism.transmission import (
+    LOAD,
     list_constants,
     name_terms,
     nominal_terms,
@@ -338,9 +339,9 @@ def _weigh_actuators(
     """Return relative standard deviations of redundant actuators, the largest one 1; None without
     them.
     """
-    if assembly.couplings or len(assembly.actuators) <= len(freedoms):
+    if assembly.couplings or len(assembly.rows) <= len(freedoms):
         return None
-    what = f"{len(assembly.actuators)} actuators for {len(freedoms)} freedoms"
+    what = f"{len(assembly.rows)} actuators for {len(freedoms)} freedoms"
     for group in groups:
         rows = len(group.rows) - len(group.unknown_joints(False))
         driven = int((group.actuator[:, 0] >= 0).sum())
@@ -350,8 +351,8 @@ def _weigh_actuators(
                 f"{assembly.name} has {what}, and limb {limb!r} has {driven} of them and {rows} "
                 "closure equations; redundant actuation needs limbs with one of each"
             )
-    sigma = [a.sigma if a.sigma is not None else 1.0 for a in assembly.actuators]
-    if len({a.sigma is None for a in assembly.actuators}) > 1 or min(sigma) <= 0:
+    sigma = [a.sigma if a.sigma is not None else 1.0 for a in assembly.rows]
+    if len({a.sigma is None for a in assembly.rows}) > 1 or min(sigma) <= 0:
         raise MechanismError(
             f"{assembly.name} has more actuators than freedoms; state a positive sigma for every "
             "actuator, or for none"
@@ -360,10 +361,19 @@ def _weigh_actuators(
 
 
 def _check_sums(assembly: Assembly, freedoms: tuple[int, ...]) -> None:
-    """Refuse sums whose numbers of readings, joints and freedoms do not fit."""
-    if assembly.couplings or not any(a.weights for a in assembly.actuators):
+    """Refuse sums whose numbers of readings, joints and freedoms do not fit, and compliances where
+    the load does not determine the forces of the drives.
+    """
+    a, joints, m = len(assembly.rows), len(assembly.driven_joints), len(freedoms)
+    elastic = [own.name for own in assembly.actuators if own.name.startswith(LOAD)]
+    if elastic and (assembly.closure != "exact" or (a > m and not assembly.couplings)):
+        why = f"{a} drives for {m} freedoms" if a > m else "over-constrained loops"
+        raise MechanismError(
+            f"{assembly.name} has {why}, so the load does not determine the forces of its drives; "
+            f"leave out the compliance of {elastic[0].removeprefix(LOAD)!r}"
+        )
+    if assembly.couplings or not any(own.weights for own in assembly.rows):
         return
-    a, joints, m = len(assembly.actuators), len(assembly.driven_joints), len(freedoms)
     if a > m:
         raise MechanismError(
             f"{assembly.name} has {a} readings for {m} freedoms, and some of them are sums; leave "

@@ -390,7 +390,8 @@ class _Rows:
         R = len(u)
         loops, ok = [], np.isfinite(u).all(axis=1)
         for i, start in zip(self._list_loops(), begin, strict=True):
-            stage, own = self.stages[i], u[:, None, self.stages[i].actuators]
+            stage = self.stages[i]
+            own = u[:, None, stage.actuators][..., : stage.robot.program.n_joints]
             weights, sums = None, self.sums[i]
             if sums is not None:
                 weights, own = sums.weights, sums.complete(own)
@@ -457,8 +458,9 @@ class _Rows:
         T = np.broadcast_to(ends[-1], (len(u), 4, 4))
         for i, base, at, part in pieces:
             stage, sums = self.stages[i], self.sums[i]
-            place = stage.actuators
-            robot, e, own = stage.robot, self.e[i], u[:, None, place]
+            robot, e = stage.robot, self.e[i]
+            own = u[:, None, stage.actuators][..., : robot.program.n_joints]
+            place = slice(stage.actuators.start, stage.actuators.start + own.shape[2])
             if sums is None:
                 by_drive = differentiate_by_drives(robot, e, own, part, None)[:, 0]
             else:
@@ -482,7 +484,7 @@ class _Rows:
         for stage, tau in zip(self.stages, self.terms, strict=True):
             triangles = find_triangles(tau)
             if len(triangles):
-                u = now.u[:, None, stage.actuators]
+                u = now.u[:, None, stage.actuators][..., : stage.robot.program.n_joints]
                 weights = select_weights(tau, stage.robot.slots.constants)
                 if weights is not None and weights.shape[2] == u.shape[2]:
                     u = apply_weights(weights, u)
@@ -597,6 +599,7 @@ def _make_rows(robot: Mechanism, values: FloatArray, target: FloatArray) -> _Row
         drives = [(name,) for name in assembly.driven_joints]
         if stage.robot.has_open_sums or assembly.couplings:
             drives = [actuator.driven_joints for actuator in assembly.actuators]
+        drives += [()] * (len(assembly.actuators) - len(drives))  # conditions
         turns += [not turning.isdisjoint(names) for names in drives]
     return _Rows(
         robot,
@@ -619,12 +622,13 @@ def _measure_spans(robot: Mechanism, turns: BoolArray) -> FloatArray:
     spans = np.where(turns, 2 * np.pi, robot.size)
     if has_spare_drives(robot):
         _, tau = robot.slots(robot.values[None])
-        strokes = np.array([actuator.stroke or (np.nan, np.nan) for actuator in robot.actuators])
-        has_all = len(turns) == robot.program.n_joints  # else readings are open sums
+        at_rest = ((np.nan if a.reference is None else a.reference,) * 2 for a in robot.actuators)
+        strokes = np.array([a.stroke or e for a, e in zip(robot.actuators, at_rest, strict=True)])
+        commanded = [a.reference is None for a in robot.actuators]
+        has_all = sum(commanded) == robot.program.n_joints  # else readings are open sums
         convert = joints_from_readings if has_all else transmit_readings
         constants = robot.slots.constants
         ends = convert(strokes.T[None], tau, constants)[0][:, ~find_fixed_rows(constants)]
-        commanded = [a.reference is None for a in robot.actuators]
         stated = np.full(len(turns), np.nan)
         stated[commanded] = np.abs(ends[1] - ends[0])
         spans = np.where(stated > 0.0, stated, spans)
@@ -637,11 +641,9 @@ def _begin(rows: _Rows, first: State) -> _Iterate:
     states = split_stage_states(robot, first)
     for stage, own, sums in zip(rows.stages, states, rows.sums, strict=True):
         joints = driven_values(stage.robot.program, own)
-        if sums is not None:  # a condition has no sum of its own
-            joints = sums.read(joints)
-            spare = len(stage.robot.actuators) - sums.chosen
-            joints = np.pad(joints, [(0, 0), (0, 0), (0, spare)])
-        u.append(joints)
+        joints = joints if sums is None else sums.read(joints)
+        spare = len(stage.robot.actuators) - joints.shape[2]  # a condition moves no joint
+        u.append(np.pad(joints, [(0, 0), (0, 0), (0, spare)]))
         if not stage.robot.is_serial:
             loops.append(own)
     return rows.evaluate(np.concatenate(u, axis=2)[:, 0], tuple(loops))

@@ -21,11 +21,15 @@ from loopcal.mechanism.actuation import ITERATIONS, DrivenJoints, drive_joints, 
 from loopcal.mechanism.chains import ChainState, each_stage, join_stage_states, locate_stage_bases
 from loopcal.mechanism.limb_rows import follow_limb
 from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.sensitivity import differentiate_pose
 from loopcal.mechanism.states import Status, driven_values, list_bodies, replace_rows, without_poses
 from loopcal.mechanism.transmission import (
     ALL_TERMS,
+    LOADED,
+    SOURCE,
     TERMS,
     apply_weights,
+    evaluate_slopes,
     evaluate_sums,
     find_triangles,
     invert_weights,
@@ -46,6 +50,10 @@ WIDE = 1e-2
 
 A pose that they leave open by more is a wrong minimum.
 """
+
+LOAD_STEPS, SETTLED = 12, 1e-12
+"""Most solutions with which loads are found, and their relative change that ends the search. Each
+step multiplies the error by about deflection over size."""
 
 
 def is_square(robot: Mechanism) -> bool:
@@ -341,7 +349,54 @@ def compute_readings(robot: Mechanism, values: FloatArray, state: State) -> Floa
     """Return the readings (t, n, a) of a state."""
     _, tau = robot.slots(values)
     joints = driven_values(robot.program, state)
-    return readings_from_joints(joints, tau, robot.slots.constants)
+    q = readings_from_joints(joints, tau, robot.slots.constants)
+    wrench = np.array(robot.assembly.load.wrench)
+    if not (robot.is_elastic and wrench.any()):
+        return q
+    loads = compute_loads(robot, values, q, state, wrench)
+    return readings_from_joints(joints, tau, robot.slots.constants, loads)
+
+
+def compute_loads(
+    robot: Mechanism, values: FloatArray, q: FloatArray, state: State, wrench: FloatArray
+) -> FloatArray:
+    """Return the loads (t, n, a) [N, Nm] of drives at states (t, n), of wrenches (6,) or (n, 6) on
+    the end platform: the power of the wrench where a drive moves alone, by its speed.
+
+    q : (t | 1, n, a) readings, of which only the slopes of transmissions count. Derivation:
+    docs/theory/families.md.
+    """
+    load = robot.assembly.load
+    force, moment = wrench[..., :3], wrench[..., 3:]
+    rotation = state.T[..., :3, :3]
+    arm = np.matmul(rotation, load.at)
+    if load.of_platform:
+        force, moment = (np.matmul(rotation, v[..., None])[..., 0] for v in (force, moment))
+    moment, force = np.broadcast_arrays(moment + np.cross(arm, force), force)
+    twists = differentiate_pose(robot, values, q, state).readings
+    power = np.matmul(np.concatenate([moment, force], axis=-1)[..., None, :], twists)[..., 0, :]
+    constants = robot.slots.constants
+    slopes = evaluate_slopes(q, robot.slots(values)[1], constants)
+    with np.errstate(divide="ignore", invalid="ignore"):  # couplings have no reading
+        return power[..., constants[:, SOURCE].astype(int)] / slopes
+
+
+def load_readings(
+    robot: Mechanism, values: FloatArray, q: FloatArray, wrench: FloatArray
+) -> FloatArray:
+    """Return readings (t | 1, n, a) with the loads of drives under wrenches (n, 6), at the pose
+    that readings and loads lead to; zero where they lead to none.
+    """
+    places, q = robot.slots.constants[:, LOADED].astype(int), np.array(q)
+    q = np.array(np.broadcast_to(q, (max(len(values), len(q)), *q.shape[1:])))
+    q[..., places[places >= 0]] = 0.0
+    for _ in range(LOAD_STEPS):
+        loads = compute_loads(robot, values, q, forward_trials(robot, values, q), wrench)
+        new, old = np.nan_to_num(loads[..., places >= 0]), q[..., places[places >= 0]]
+        q[..., places[places >= 0]] = new
+        if np.abs(new - old).max(initial=0.0) <= SETTLED * np.abs(new).max(initial=0.0):
+            break
+    return q
 
 
 # Frames of the links along each limb, for limits of joints and for pictures.

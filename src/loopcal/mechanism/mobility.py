@@ -39,7 +39,7 @@ from loopcal.mechanism.states import driven_values
 from loopcal.mechanism.transmission import select_weights
 from loopcal.numerics.decomposition import are_nonzero
 from loopcal.typing import FloatArray
-from loopcal.units import SI_SYMBOLS
+from loopcal.units import SI_SYMBOLS, Dimension
 
 RANK = 1e-9
 """Relative size below which a singular value of closure equations counts as zero.
@@ -397,6 +397,8 @@ def _check_ranges(assembly: Assembly) -> None:
         for limb in assembly.limbs
         for joint in limb.joints
     ]
+    for name, bounds in assembly.load.ranges.items():
+        ranges.append((f"range of {name} runs", bounds, Dimension(name.partition(".")[0])))
     for what, bounds, dimension in ranges:
         if bounds and not bounds[0] < bounds[1]:
             raise MechanismError(

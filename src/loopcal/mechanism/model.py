@@ -14,8 +14,10 @@ from numpy.typing import ArrayLike
 from loopcal.engine import MapPattern, ParameterMap, Program, State
 from loopcal.errors import MechanismError, suggest_names
 from loopcal.findings import Finding, Quantity
-from loopcal.mechanism.assembly import Actuator, Assembly, SharedMap, is_serial
+from loopcal.mechanism.assembly import FORCES, Actuator, Assembly, SharedMap, is_serial
 from loopcal.mechanism.transmission import (
+    LOAD,
+    LOADED,
     REFERENCE,
     SOURCE,
     differentiate_sums,
@@ -114,13 +116,13 @@ class SlotMap:
 
     slots(v) = M (v - nominal) + sum over shared maps of [g(v) - g(nominal)]. The first
     `n_displacements` slots are e, the others the terms of the actuators, (a, k) row by row, with
-    k = 18 where one is a triangle drive, 18 + K + J with tables of K points and sums of J joints, 8
+    k = 19 where one is a triangle drive, 19 + K + J with tables of K points and sums of J joints, 9
     elsewhere.
 
     matrix : (s, p) M. shared : the shared maps, each with the positions of its inputs and of its
         outputs, which differ.
     nominal : (p,). n_displacements : length of e.
-    terms : (a, k) nominal transmission terms. constants : (a, 2 + K) of `list_constants`.
+    terms : (a, k) nominal transmission terms. constants : (a, 5 + K) of `list_constants`.
     """
 
     matrix: FloatArray
@@ -373,6 +375,11 @@ class Mechanism(DrawnResult):
         return any(row.weights for row in self.assembly.rows)
 
     @cached_property
+    def is_elastic(self) -> bool:
+        """Whether a drive has a compliance."""
+        return bool((self.slots.constants[:, LOADED] >= 0).any())
+
+    @cached_property
     def has_open_sums(self) -> bool:
         """Whether only closure determines the driven joints, because their sums are fewer."""
         return not self.stages and self.program.n_joints > len(self.assembly.rows)
@@ -389,12 +396,14 @@ class Mechanism(DrawnResult):
         return self.with_values(self.parameters.nominal)
 
     def with_conditions(self, values: Mapping[str, float]) -> Mechanism:
-        """Return the same robot with other references of conditions [degC, s], such as today's
-        temperature, at which inverse kinematics holds them.
+        """Return the same robot with other references of conditions [degC, s, N, Nm], such as
+        today's temperature and load, at which inverse kinematics and simulations hold them.
 
         Raises MechanismError: an unknown condition.
         """
         known = [a.name for a in self.actuators if a.reference is not None]
+        known = [name for name in known if not name.startswith(LOAD)]
+        known += FORCES if self.is_elastic else ()
         for name in values:
             if name not in known:
                 raise MechanismError(
@@ -402,7 +411,8 @@ class Mechanism(DrawnResult):
                     f"it has {', '.join(known) or 'none'}"
                 )
         actuators = tuple(
-            replace(a, reference=values.get(a.name, a.reference)) for a in self.actuators
+            replace(a, reference=values[a.name], stroke=None) if a.name in values else a
+            for a in self.actuators
         )
         constants = self.slots.constants.copy()
         for i, actuator in enumerate(actuators):
@@ -413,9 +423,14 @@ class Mechanism(DrawnResult):
             names = {a.name for a in stage.robot.actuators}
             own = {name: value for name, value in values.items() if name in names}
             stages.append(replace(stage, robot=stage.robot.with_conditions(own)))
+        load = self.assembly.load
+        wrench = tuple(map(values.get, FORCES, load.wrench))
+        ranges = {name: ends for name, ends in load.ranges.items() if name not in values}
         return replace(
             self,
-            assembly=replace(self.assembly, actuators=actuators),
+            assembly=replace(
+                self.assembly, actuators=actuators, load=replace(load, wrench=wrench, ranges=ranges)
+            ),
             slots=replace(self.slots, constants=constants),
             stages=tuple(stages),
         )

@@ -35,6 +35,7 @@ from loopcal.mechanism.kinematics import (
     compute_closure_sign,
     compute_readings,
     forward_trials,
+    load_readings,
 )
 from loopcal.mechanism.limb_rows import name_passive_joints, reduce_to_platform
 from loopcal.mechanism.model import Mechanism
@@ -471,13 +472,19 @@ class Solution(TableResult):
         )
 
 
+def list_commanded(robot: Mechanism) -> BoolArray:
+    """Return which readings (a,) are commanded, which those of conditions are not."""
+    return np.array([actuator.reference is None for actuator in robot.actuators], dtype=bool)
+
+
 def forward(robot: Mechanism, q: ArrayLike, start: Solution | None = None) -> Solution:
     """Solve forward kinematics by Newton's method on the loop closure, beginning at `start`.
 
     Parameters
     ----------
     q : (n, a) readings [m or rad], or (n, 2 a) with their directions of approach (+1, -1, 0
-        unknown) behind them.
+        unknown) behind them. Rows of commanded readings alone are those at today's conditions, see
+        `Mechanism.with_conditions`.
     start : a solution of one row or n rows that selects the assembly mode (default: home).
 
     Rows that fail are marked in `status`, never raised.
@@ -488,6 +495,14 @@ def forward(robot: Mechanism, q: ArrayLike, start: Solution | None = None) -> So
     """
     a = len(robot.actuators)
     readings = np.atleast_2d(np.asarray(q, dtype=float))
+    commanded = list_commanded(robot)
+    if readings.ndim == 2 and readings.shape[1] == commanded.sum() < a:
+        known, references = readings, [actuator.reference or 0.0 for actuator in robot.actuators]
+        readings = np.tile(references, (len(known), 1))
+        readings[:, commanded] = known
+        if robot.is_elastic:
+            wrench = np.array(robot.assembly.load.wrench)
+            readings = load_readings(robot, robot.values[None], readings[None], wrench)[0]
     if readings.ndim != 2 or readings.shape[1] not in (a, 2 * a):
         raise DataError(
             f"{readings.shape[-1]} readings a row were given, but {robot.name} has {a} actuators "

@@ -2,19 +2,20 @@
 """Transmissions: the value of a joint from the reading of its actuator, and back.
 
     joint = offset + gain r + curve r^2 + sin1 sin(w r) + cos1 cos(w r)
-            + sin2 sin(2 w r) + cos2 cos(2 w r) + backlash d / 2 + table(r)
+            + sin2 sin(2 w r) + cos2 cos(2 w r) + backlash d / 2 + compliance f + table(r)
 
-with w = 2 pi / period and d = +1 or -1 the direction from which the reading was approached (0 if
-unknown). A gear ratio or a spool radius is a gain. A spool whose radius changes with the line on it
-is a curve: radius r0 - b phi / (2 pi) pays out r0 phi - b phi^2 / (4 pi). Derivation:
-docs/theory/families.md. A table gives values at points, between which it is a broken line or a
-natural cubic spline, and straight beyond. Of a triangle drive this is the length of the actuator,
-from which the joint's angle follows.
+with w = 2 pi / period, d = +1 or -1 the direction from which the reading was approached (0 if
+unknown) and f [N, Nm] the load of the drive, a reading that is never commanded. A gear ratio or a
+spool radius is a gain. A spool whose radius changes with the line on it is a curve: radius r0 - b
+phi / (2 pi) pays out r0 phi - b phi^2 / (4 pi). Derivation: docs/theory/families.md. A table
+gives values at points, between which it is a broken line or a natural cubic spline, and straight
+beyond. Of a triangle drive this is the length of the actuator, from which the joint's angle
+follows.
 
 Readings are (t, n, a), or (t, n, 2 a) with the directions of approach behind them. Terms tau are
-(t, a, 8), or (t, a, 18) with those of triangles behind them, all zero for any other drive. Values
-of tables with up to K points follow, (t, a, 18 + K). Where a drive reads a sum of joint values, the
-weights W of the J driven joints follow, (t, a, 18 + K + J), and the formula gives the sums s = W
+(t, a, 9), or (t, a, 19) with those of triangles behind them, all zero for any other drive. Values
+of tables with up to K points follow, (t, a, 19 + K). Where a drive reads a sum of joint values, the
+weights W of the J driven joints follow, (t, a, 19 + K + J), and the formula gives the sums s = W
 joints. What no parameter changes are the constants of `list_constants`.
 
 Tau and constants have a row for each commanded reading and each coupling. A coupling is such a row
@@ -175,7 +176,8 @@ def _apply(matrix: FloatArray, vector: FloatArray) -> FloatArray:
 
 class Shape(NamedTuple):
     """What a term adds to the value of a joint: `value`(r, d, w) per unit of the term, and its
-    derivative `slope`(r, w) by the reading. r, d : readings and directions (t, n, a). w : (a,).
+    derivative `slope`(r, w) by the reading. r, d : readings and directions, of a compliance loads,
+    (t, n, a). w : (a,).
     """
 
     value: Callable[[FloatArray, FloatArray, FloatArray], FloatArray]
@@ -198,24 +200,29 @@ SHAPES: Mapping[str, Shape] = {
         lambda r, d, w: _is_periodic(w) * np.cos(2 * w * r), lambda r, w: -2 * w * np.sin(2 * w * r)
     ),
     "backlash": Shape(lambda r, d, w: 0.5 * d, lambda r, w: np.zeros_like(r)),
+    "compliance": Shape(lambda r, d, w: d, lambda r, w: np.zeros_like(r)),
 }
-"""The terms that a joint value is a sum of, in the order of the last axis of tau (t, a, 8). To add
+"""The terms that a joint value is a sum of, in the order of the last axis of tau (t, a, 9). To add
 one, state its shape.
 
-Each has the joint's unit, per power of the reading's unit; of a triangle drive, that of its length.
+Each has the joint's unit, per power of the reading's unit or per N or Nm of the load; of a triangle
+drive, that of its length.
 """
 TERMS = tuple(SHAPES)
 HARMONICS = ("sin1", "cos1", "sin2", "cos2")
 ALL_TERMS = (*TERMS, *TRIANGLE_TERMS)
-"""Terms of a robot with triangle drives, in the order of the last axis of tau (t, a, 18)."""
-SIDE = ALL_TERMS.index("side")
+"""Terms of a robot with triangle drives, in the order of the last axis of tau (t, a, 19)."""
+SIDE, COMPLIANCE = ALL_TERMS.index("side"), ALL_TERMS.index("compliance")
 TABLE = "table"
 """What the name of the term of a table begins with; the number of its point follows."""
 WEIGHT = "weight."
 """What the name of the term of a weight begins with; the name of a driven joint follows."""
-SOURCE, REFERENCE, FIXED = 2, 3, 4
+LOAD = "load."
+"""What the name of the load of a drive begins with; the name of the drive follows."""
+SOURCE, REFERENCE, LOADED, FIXED = 2, 3, 4, 5
 """Constants of a row before the points of its table: frequency, whether it is cubic, the number of
-its reading, -1 for none, and the reference of that reading, NaN where it is commanded."""
+its reading, -1 for none, the reference of that reading, NaN where it is commanded, and the number
+of its load among the readings, -1 for none."""
 
 # Tables: a correction, or all of the motion of a cam, between points.
 
@@ -268,7 +275,7 @@ def _sum_tables(
     q: FloatArray, tau: FloatArray, constants: FloatArray, derivative: int = 0
 ) -> FloatArray:
     """Return what tables add to joint values (t, n, a), or to their slopes."""
-    r, _ = split_readings(q, constants)
+    r = split_readings(q, constants)[0]
     values = select_table(tau, constants)[:, None]
     return (_weigh_tables(r, constants, derivative) * values).sum(axis=-1)
 
@@ -286,7 +293,7 @@ def name_terms(actuators: Sequence[Actuator]) -> tuple[str, ...]:
 
 
 def nominal_terms(actuators: Sequence[Actuator]) -> FloatArray:
-    """Return the nominal transmission terms (a, 8), (a, 18) if one is a triangle drive, or (a, 18 +
+    """Return the nominal transmission terms (a, 9), (a, 19) if one is a triangle drive, or (a, 19 +
     K + J) with tables and summed drives.
     """
     for actuator in actuators:
@@ -314,10 +321,10 @@ def nominal_terms(actuators: Sequence[Actuator]) -> FloatArray:
 def list_constants(
     actuators: Sequence[Actuator], readings: Sequence[Actuator] | None = None
 ) -> FloatArray:
-    """Return what no parameter changes (a, 4 + K): the angular frequency of the harmonics [rad per
+    """Return what no parameter changes (a, 5 + K): the angular frequency of the harmonics [rad per
     unit of reading], 0 for none, whether a table is cubic, the number of the reading among
-    `readings` (default: each row has its own), its reference, and the readings at the points of
-    the table, NaN behind the last one.
+    `readings` (default: each row has its own), its reference, the number of its load, and the
+    readings at the points of the table, NaN behind the last one.
     """
     points = max((len(a.points) for a in actuators), default=0)
     constants = np.full((len(actuators), FIXED + points), np.nan)
@@ -326,7 +333,8 @@ def list_constants(
         column = a.name if a.column is None else a.column
         source, reference = known.get(column, (-1, None))
         row[:SOURCE] = 2 * np.pi / a.period if a.period else 0.0, a.interpolation == "cubic"
-        row[SOURCE:FIXED] = source, np.nan if reference is None else reference
+        load = known.get(LOAD + a.name, (-1, None))[0]
+        row[SOURCE:FIXED] = source, np.nan if reference is None else reference, load
         row[FIXED : FIXED + len(a.points)] = a.points
     return constants
 
@@ -343,7 +351,7 @@ def evaluate_references(tau: FloatArray, constants: FloatArray) -> FloatArray:
     of those without one.
     """
     own = constants.copy()
-    own[:, SOURCE] = np.arange(len(own))
+    own[:, SOURCE], own[:, LOADED] = np.arange(len(own)), -1
     return evaluate_sums(np.nan_to_num(constants[None, None, :, REFERENCE]), tau, own)
 
 
@@ -377,7 +385,7 @@ def _evaluate_shapes(
     """Return what each of the terms adds per unit to what the transmissions give, (t | 1, n, a); a
     dimension of a triangle adds nothing.
     """
-    r, approach = split_readings(q, constants)
+    r, approach, load = split_readings(q, constants)
     first, w = len(ALL_TERMS), constants[:, 0]
     of_points: FloatArray | None = None
     if any(term >= first for term in terms):
@@ -385,7 +393,7 @@ def _evaluate_shapes(
 
     def evaluate(term: int) -> FloatArray:
         if term < len(TERMS):
-            return SHAPES[TERMS[term]].value(r, approach, w)
+            return SHAPES[TERMS[term]].value(r, load if term == COMPLIANCE else approach, w)
         if of_points is None or term < first:
             return np.zeros_like(r)
         return of_points[..., term - first]
@@ -419,7 +427,14 @@ def joint_slopes(q: FloatArray, tau: FloatArray, constants: FloatArray) -> Float
     """Return d joint / d reading (t, n, a), of plain gains (t | 1, 1, a); of summed drives d sum /
     d reading.
     """
-    slopes, triangles = _evaluate_slopes(q, tau, constants), find_triangles(tau)
+    return _divide_by_arms(evaluate_slopes(q, tau, constants), q, tau, constants)
+
+
+def _divide_by_arms(
+    slopes: FloatArray, q: FloatArray, tau: FloatArray, constants: FloatArray
+) -> FloatArray:
+    """Return slopes (t | 1, n | 1, a) of angles, of those of the lengths of triangles."""
+    triangles = find_triangles(tau)
     if not len(triangles):
         return slopes
     arm, _ = _differentiate_triangles(transmit_readings(q, tau, constants), tau, triangles)
@@ -429,22 +444,40 @@ def joint_slopes(q: FloatArray, tau: FloatArray, constants: FloatArray) -> Float
     return slopes
 
 
-def readings_from_joints(joints: FloatArray, tau: FloatArray, constants: FloatArray) -> FloatArray:
-    """Return the readings (t, n, a) of joint values, without backlash; Newton's method adds what is
-    not linear. Readings that are never commanded have their reference.
+def differentiate_by_readings(q: FloatArray, tau: FloatArray, constants: FloatArray) -> FloatArray:
+    """Return the derivatives (t | 1, n | 1, a, readings) of what the transmissions give by all
+    readings, loads among them.
+    """
+    columns = np.arange(count_readings(constants))
+    slopes = joint_slopes(q, tau, constants)
+    by_readings = slopes[..., None] * (constants[:, SOURCE, None] == columns)
+    if (constants[:, LOADED] < 0).all():
+        return by_readings
+    by_load = _divide_by_arms(tau[:, None, :, COMPLIANCE], q, tau, constants)
+    return by_readings + by_load[..., None] * (constants[:, LOADED, None] == columns)
+
+
+def readings_from_joints(
+    joints: FloatArray, tau: FloatArray, constants: FloatArray, loads: FloatArray | None = None
+) -> FloatArray:
+    """Return the readings (t, n, r) of joint values at loads (t | 1, n, a) of the rows, without
+    backlash; Newton's method adds what is not linear. Other readings that are never commanded have
+    their reference, and loads are zero without `loads`.
     """
     if (weights := select_weights(tau, constants)) is not None:
         joints = apply_weights(weights, joints)
-    if (fixed := find_fixed_rows(constants)).any():
-        own = constants[~fixed, :FIXED], tau[:, ~fixed, : len(ALL_TERMS)]
-        if count_points(constants):
-            own = constants[~fixed], tau[:, ~fixed, : len(ALL_TERMS) + count_points(constants)]
-        readings = readings_from_joints(joints[..., ~fixed], own[1], own[0])
-        source = constants[:, SOURCE].astype(int)
-        last = np.full((*readings.shape[:2], source.max() + 1), np.nan)
+    fixed, count = find_fixed_rows(constants), count_readings(constants)
+    if fixed.any() or count > len(constants):
+        own, terms = constants[~fixed], len(ALL_TERMS) + count_points(constants)
+        own[:, SOURCE], own[:, LOADED] = np.arange(len(own)), -1
+        given = None if loads is None else loads[..., ~fixed]
+        readings = readings_from_joints(joints[..., ~fixed], tau[:, ~fixed, :terms], own, given)
+        source, load = constants[:, SOURCE].astype(int), constants[:, LOADED].astype(int)
+        last = np.full((*readings.shape[:2], count), np.nan)
         last[..., source[~fixed]] = readings
-        is_given = fixed & (source >= 0)
+        is_given, is_loaded = fixed & (source >= 0), load >= 0
         last[..., source[is_given]] = constants[is_given, REFERENCE]
+        last[..., load[is_loaded]] = 0.0 if loads is None else loads[..., is_loaded]
         return last
     triangles = find_triangles(tau)
     if len(triangles):
@@ -453,6 +486,8 @@ def readings_from_joints(joints: FloatArray, tau: FloatArray, constants: FloatAr
         joints[..., triangles] = compute_length(
             joints[..., triangles], _select_triangles(tau, triangles)
         )
+    if loads is not None:
+        joints = joints - tau[:, None, :, COMPLIANCE] * loads
     if len(tau) == 1 and not tau[..., 0].any() and bool((tau[..., 1] == 1.0).all()):
         readings = joints
     else:
@@ -463,7 +498,7 @@ def readings_from_joints(joints: FloatArray, tau: FloatArray, constants: FloatAr
     if count_points(constants):
         readings = _guess_readings(joints, readings, tau, constants)
     for _ in range(20):
-        slopes = _evaluate_slopes(readings, tau, constants)
+        slopes = evaluate_slopes(readings, tau, constants)
         step = (evaluate_sums(readings, tau, constants) - joints) / slopes
         readings = readings - step
         if np.abs(step).max(initial=0.0) <= 1e-15 * np.abs(readings).max(initial=1.0):
@@ -539,7 +574,7 @@ def evaluate_sums(q: FloatArray, tau: FloatArray, constants: FloatArray) -> Floa
     """Return the joint values (t, n, a) of readings; of triangle drives lengths, else sums."""
     has_tables = count_points(constants) > 0
     if not tau[..., 2 : len(TERMS)].any() and not has_tables:
-        readings, _ = split_readings(q, constants)
+        readings = split_readings(q, constants)[0]
         if len(tau) in (1, len(q)) and (tau[..., :2] == (0.0, 1.0)).all():
             return readings + 0.0  # no offset and no gain: one pass, with the same bits
         return tau[:, None, :, 0] + readings * tau[:, None, :, 1]
@@ -551,12 +586,12 @@ def evaluate_sums(q: FloatArray, tau: FloatArray, constants: FloatArray) -> Floa
     return values + _sum_tables(q, tau, constants) if has_tables else values
 
 
-def _evaluate_slopes(q: FloatArray, tau: FloatArray, constants: FloatArray) -> FloatArray:
+def evaluate_slopes(q: FloatArray, tau: FloatArray, constants: FloatArray) -> FloatArray:
     """Return d joint / d reading; of triangle drives d length / d reading."""
     has_tables = count_points(constants) > 0
     if not tau[..., 2:7].any() and not has_tables:
         return tau[:, None, :, 1]
-    r, _ = split_readings(q, constants)
+    r = split_readings(q, constants)[0]
     slopes = sum(
         (
             shape.slope(r, constants[:, 0]) * tau[:, None, :, i]
@@ -588,23 +623,22 @@ def find_reversed(joints: FloatArray, tau: FloatArray, triangles: IntArray) -> B
     return np.sin(joints[..., triangles] - gamma) * triangle[..., 8] < 0.0
 
 
-def split_readings(q: FloatArray, constants: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the reading and the direction of approach of each row (.., a), 0 where none are
-    given.
+def count_readings(constants: FloatArray) -> int:
+    """Return how many readings the rows have, loads among them."""
+    return int(constants[:, [SOURCE, LOADED]].max(initial=-1.0)) + 1
+
+
+def split_readings(
+    q: FloatArray, constants: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the reading, the direction of approach and the load of each row (.., a), 0 where none
+    are given.
     """
-    source = constants[:, SOURCE].astype(int)
-    a = int(source.max(initial=-1)) + 1
+    source, load = constants[:, SOURCE].astype(int), constants[:, LOADED].astype(int)
+    a = count_readings(constants)
     parts = q[..., :a], q[..., a:] if q.shape[-1] == 2 * a else np.zeros_like(q[..., :a])
     if len(source) == a and bool((source == np.arange(a)).all()):
-        return parts
+        return *parts, np.broadcast_to(0.0, parts[0].shape)
     none = np.zeros((*q.shape[:-1], 1))  # what a row with the number -1 reads
-    r, approach = (np.concatenate([part, none], axis=-1)[..., source] for part in parts)
-    return r, approach
-
-
-def distribute_readings(slopes: FloatArray, constants: FloatArray) -> FloatArray:
-    """Return the derivatives (t, n, a, readings) of rows by readings, of slopes (t, n, a) by the
-    reading of each row.
-    """
-    source = constants[:, SOURCE]
-    return slopes[..., None] * (source[:, None] == np.arange(source.max(initial=-1) + 1))
+    readings, approach = (np.concatenate([part, none], axis=-1) for part in parts)
+    return readings[..., source], approach[..., source], readings[..., load]

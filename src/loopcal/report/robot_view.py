@@ -11,7 +11,7 @@ import numpy as np
 
 from loopcal import geometry
 from loopcal.findings.wording import name_count
-from loopcal.mechanism.transmission import TABLE, TRIANGLE_TERMS, WEIGHT, compute_range
+from loopcal.mechanism.transmission import LOAD, TABLE, TRIANGLE_TERMS, WEIGHT, compute_range
 from loopcal.results.tables import (
     ABSENT,
     Block,
@@ -42,12 +42,14 @@ def view_robot(inspection: RobotInspection) -> list[Block]:
     """Return the page of a robot."""
     robot = inspection.robot
     n, free = len(robot.parameters), int(robot.parameters.free.sum())
-    actuators, parameters = name_count(len(robot.actuators), "actuator"), name_count(n, "parameter")
+    commanded = sum(actuator.reference is None for actuator in robot.actuators)
+    actuators, parameters = name_count(commanded, "actuator"), name_count(n, "parameter")
     blocks: list[Block] = [
         f"{robot.name}: {actuators}, {parameters}, {free} free",
         f"file: {robot.record.path}",
         f"freedoms: {' '.join(robot.freedoms)}",
         f"commanded in: {' '.join(robot.controlled)}",
+        *_describe_load(robot),
         *format_list([(f.severity.value, str(f)) for f in inspection.findings]),
     ]
     tables = (
@@ -58,6 +60,15 @@ def view_robot(inspection: RobotInspection) -> list[Block]:
         _build_common_error_table(robot),
     )
     return [*blocks, *(table for table in tables if table.rows)]
+
+
+def _describe_load(robot: Mechanism) -> list[str]:
+    """Return where the load of an elastic robot acts, and in which axes."""
+    load, unit = robot.assembly.load, robot.get_unit(Dimension.LENGTH)
+    at = ", ".join(format_in(unit, x) for x in load.at)
+    axes = "platform" if load.of_platform else "base"
+    text = f"load: force and moment in axes of the {axes}, at [{at}] {unit} of the platform"
+    return [text] if robot.is_elastic else []
 
 
 def _build_actuator_table(inspection: RobotInspection) -> Table:
@@ -96,7 +107,7 @@ def _build_sum_table(robot: Mechanism) -> Table:
     joint value.
     """
     sums, couplings = robot.assembly.rows, robot.assembly.couplings
-    is_sum = any(row.weights for row in sums)
+    is_sum = any(row.weights not in ({}, {row.name: 1.0}) for row in sums)
     rows = [
         (row.name, format_sum(row.weights or dict.fromkeys(row.driven_joints, 1.0)))
         for row in sums
@@ -151,7 +162,7 @@ def _build_common_error_table(robot: Mechanism) -> Table:
 
 Units = Mapping[Dimension, Unit]
 JOINTS = {"R": ("turns about z", Dimension.ANGLE), "P": ("slides along z", Dimension.LENGTH)}
-POWERS = {"gain": 1, "curve": 2}
+POWERS = {"gain": 1, "curve": 2, "compliance": 1}
 PLACE = ("x", "y", "z", "roll", "pitch", "yaw")
 
 
@@ -217,7 +228,6 @@ def _build_transmission_table(robot: Mechanism, units: Units) -> Table:
     rows = []
     for actuator in robot.assembly.rows:
         joint_unit = units[_joint_dimension(robot, actuator.name)]
-        reading = units[_find_reading(robot, actuator.name)]
         limbs, driven = robot.assembly.limbs, actuator.driven_joints
         named = ((limb.name, joint) for limb in limbs for joint in limb.joints)
         joints = [f"{limb}/{joint.name}" for limb, joint in named if joint.actuator in driven]
@@ -226,6 +236,7 @@ def _build_transmission_table(robot: Mechanism, units: Units) -> Table:
         for term, value in {"gain": 1.0, **actuator.terms}.items():
             if value and term not in TRIANGLE_TERMS:
                 power = POWERS.get(term, 0)
+                reading = units[_find_reading(robot, actuator.name, term)]
                 number = value * reading.factor_to_si**power / joint_unit.factor_to_si
                 unit = _unit_of_term(joint_unit, reading, power)
                 at = ""
@@ -292,7 +303,7 @@ def _unit_of_address(robot: Mechanism, address: Address, units: Units) -> tuple[
     """Return factor to SI and symbol of what an address changes."""
     length = units[Dimension.LENGTH]
     if address.element == "transmission":
-        reading = units[_find_reading(robot, address.owner)]
+        reading = units[_find_reading(robot, address.owner, address.axis)]
         if address.axis.startswith(WEIGHT):
             is_radius = _is_radius(robot, address.owner, address.axis.removeprefix(WEIGHT))
             return (length.factor_to_si, f"{length}/rad") if is_radius else (1.0, "1")
@@ -307,12 +318,13 @@ def _unit_of_address(robot: Mechanism, address: Address, units: Units) -> tuple[
     return unit.factor_to_si, unit.symbol
 
 
-def _find_reading(robot: Mechanism, name: str) -> Dimension:
-    """Return the dimension of the reading of a drive, or of the condition of a coupling; without
-    one that of its sum.
+def _find_reading(robot: Mechanism, name: str, term: str = "") -> Dimension:
+    """Return the dimension of the reading of a drive, of its load for the term `compliance`, or of
+    the condition of a coupling; without one that of its sum.
     """
     row = next(row for row in robot.assembly.rows if row.name == name)
-    return next((a.dimension for a in robot.actuators if a.name == row.column), row.dimension)
+    column = LOAD + name if term == "compliance" else row.column
+    return next((a.dimension for a in robot.actuators if a.name == column), row.dimension)
 
 
 def _is_radius(robot: Mechanism, name: str, joint: str) -> bool:

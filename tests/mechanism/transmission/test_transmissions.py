@@ -7,6 +7,7 @@ from numpy.testing import assert_allclose
 
 from loopcal.mechanism.assembly import Actuator
 from loopcal.mechanism.transmission import (
+    LOAD,
     SHAPES,
     SIDE,
     TABLE,
@@ -67,6 +68,10 @@ NAMES = [name for name in name_terms(DRIVES) if name not in ("side", "middle")]
 @pytest.mark.parametrize("term", NAMES)
 def test_the_derivative_by_a_term_is_that_of_differences(term: str) -> None:
     q, tau, constants, names = describe("one joint each")
+    if term == "compliance":
+        loads = [Actuator(f"{LOAD}{a.name}", Dimension.FORCE, reference=0.0) for a in DRIVES]
+        constants = list_constants(DRIVES, (*DRIVES, *loads))
+        q = np.concatenate([READINGS, READINGS[..., ::-1]], axis=-1)
     i = names.index(term)
     move = np.zeros_like(tau)
     move[..., i] = STEP

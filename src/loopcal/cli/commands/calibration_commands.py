@@ -264,6 +264,7 @@ def compensate(
         of="loopcal.apply.compensation:compensate",
         type=opt.Count("STEPS", 1),
     ),
+    at: tuple[tuple[str, float], ...] = opt.AT,
     frame: str = opt.frame("loopcal.apply.compensation:compensate"),
     residual_map: bool = opt.flag(
         "Correct also the smooth errors that the residuals show, if held-out regions prove a gain."
@@ -282,6 +283,7 @@ def compensate(
     Examples:
       loopcal compensate run targets.csv -o readings.csv
       loopcal compensate run targets.csv --mode commands -o commands.csv
+      loopcal compensate run targets.csv --at temperature.arms=31 -o readings.csv
     """
     from loopcal.io.core.outputs import refuse_outputs
     from loopcal.io.core.text_file import write_text
@@ -300,7 +302,7 @@ def compensate(
     coordinates, labels = load_targets(targets, robot)
     old = None if controller is None else lc.load_robot(controller)
     with terminal.TerminalProgress() as progress:
-        how = {"frame": frame, "residual_map": residual_map}
+        how = {"frame": frame, "residual_map": residual_map, "conditions": dict(at)}
         result = lc.compensate(known, coordinates, mode, old, steps, labels, progress, **how)
     if output is not None:
         write_text(output, format_compensation(result))

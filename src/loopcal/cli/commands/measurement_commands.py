@@ -26,6 +26,7 @@ def identifiability(
     poses: Path | None = opt.path("Instead of DATA: CSV file of poses that could be measured."),
     draw: int = opt.DRAW,
     seed: int = opt.seed("the drawn poses", f"{opt.SIMULATION}:predict_noise_free"),
+    at: tuple[tuple[str, float], ...] = opt.AT,
     unknown: dict[str, Any] = opt.UNKNOWN,
     reduced: bool = opt.flag(
         "Also choose a smallest set of parameters, and show what the others are merged into.",
@@ -84,6 +85,7 @@ def identifiability(
     if useful is None and useful_angle is not None:
         raise DataError("--useful-angle belongs to --useful; add --useful, such as --useful 1um")
     machine, drawn = opt.open_robot(robot, (output,), (*data, poses), force), []
+    machine = machine.with_conditions(dict(at))
     if data:
         measurements = opt.read_fitted_measurements(data, machine, allowed)
     else:
@@ -144,6 +146,7 @@ def simulate(
         "Instead of poses and instrument: data file of a plan, to be filled in.", metavar="SHEET"
     ),
     output: Path = opt.path("Measurement file to write.", "-o", required=True),
+    at: tuple[tuple[str, float], ...] = opt.AT,
     instrument: dict[str, Any] = opt.INSTRUMENT,
     distribution: str = opt.DISTRIBUTION,
     sigma_reading: str | None = opt.SIGMA_READING,
@@ -177,6 +180,7 @@ def simulate(
     from loopcal.io.core.outputs import restore_on_failure
 
     machine = opt.open_robot(robot, (output, truth), (poses, fill), force)
+    machine = machine.with_conditions(dict(at))
     if fill is not None:
         result = _fill_in(machine, fill, draw_errors, seed)
         source = fill.name

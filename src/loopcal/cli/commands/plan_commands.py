@@ -85,6 +85,7 @@ def plan(
     measured: tuple[Path, ...] = opt.data_option(
         "Measurements that exist already. May be given several times.", multiple=True
     ),
+    at: tuple[tuple[str, float], ...] = opt.AT,
     constraints: lc.Constraints = opt.CONSTRAINTS,
     n_candidates: int = opt.option(
         "Number of candidate poses to draw.",
@@ -124,7 +125,7 @@ def plan(
     files |= {f"measured {i}": path for i, path in enumerate(measured, 1)}
     inputs = {role: path for role, path in files.items() if path is not None}
     refuse_folder(output, PLAN, force, list(inputs.values()))
-    machine = lc.load_robot(robot)
+    machine = lc.load_robot(robot).with_conditions(dict(at))
     if unknown["measure"] == (PLANE_LINE,):
         for name, reason in EXCLUDED_BY_PLANE_LINE.items():
             sentence = (

@@ -28,6 +28,7 @@ from loopcal.io.core.csv_table import (
     format_scaled,
     suggest_header,
 )
+from loopcal.mechanism.assembly import FORCES
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import get_dimension
 from loopcal.typing import FloatArray, IntArray
@@ -286,10 +287,10 @@ def _number(name: str, dimension: Dimension) -> NumberColumn:
 def _readings(robot: Mechanism, kinds: Sequence[Kind]) -> Iterable[Column]:
     del kinds
     for a in robot.actuators:
-        if a.reference is not None:
+        if is_context(a.name):
             yield ContextColumn(a.name)
-            continue
-        yield NumberColumn(a.name, a.dimension, robot.units[a.dimension])
+        else:
+            yield NumberColumn(a.name, a.dimension, robot.units[a.dimension])
 
 
 def _text_rule(meaning: str, column: TextColumn) -> ColumnRule:
@@ -312,6 +313,15 @@ RULES: tuple[ColumnRule, ...] = (
     _text_rule("rows of a session share unknown frames and targets", TextColumn("session")),
     _text_rule("rows of a group share a surface or the constant of a lock", TextColumn("group")),
     ColumnRule("ACTUATOR", "[mm] or [deg]", "reading of the actuator", _readings),
+    ColumnRule(
+        "force.AXIS, moment.AXIS, load.ACTUATOR",
+        "[N], [Nm]",
+        "force and moment on the platform of an elastic robot; or the load of each elastic drive",
+        lambda robot, _: [
+            _number(name, Dimension(name.partition(".")[0]))
+            for name in (FORCES if robot.is_elastic else ())
+        ],
+    ),
     ColumnRule(
         f"{COMMANDED}COORDINATE",
         "[mm] or [deg]",

@@ -49,8 +49,11 @@ from loopcal.io.data.kind_settings import (
     read_stated_values,
 )
 from loopcal.io.robot.robot_file import check_format, list_shipped_robots, load_robot
+from loopcal.mechanism.assembly import FORCES
+from loopcal.mechanism.kinematics import load_readings
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import get_dimension
+from loopcal.mechanism.transmission import LOAD
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import EXAMPLES, SMALLEST_SD, find_sd_fault
 
@@ -277,7 +280,9 @@ def _read_readings(file: _File, robot: Mechanism, several: bool) -> _File:
     table, names = file.table, file.names
     controller = _load_controller(table, robot)
     columns = _list_reading_columns(table, robot, controller)
-    rows = np.column_stack([column.parse(table) for column in columns])
+    known = list_columns(robot, ())
+    loads = [known[name] for name in _list_load_columns(table, robot)]
+    rows = np.column_stack([column.parse(table) for column in (*columns, *loads)])
     absent = np.isnan(rows)
     may_be_absent = controller is None and _states_reading_noise(table, robot)
     begin = np.array(
@@ -291,7 +296,8 @@ def _read_readings(file: _File, robot: Mechanism, several: bool) -> _File:
         is_first = begin == np.arange(len(rows))
         hint = f", or state '{READING_NOISE}', so that empty means not read"
         for row in np.flatnonzero(is_first & absent.any(axis=1) & ~(several & absent.all(axis=1))):
-            sentence = f"column {columns[int(np.argmax(absent[row]))].name!r} is empty"
+            name = (*columns, *loads)[int(np.argmax(absent[row]))].name
+            sentence = f"column {name!r} is empty"
             act = f"write its value{hint if controller is None else ''}"
             raise table.row_error(int(row), f"{sentence}; {act}")
     is_same = ((rows == rows[begin]) | (absent & absent[begin])).all(axis=1) & (begin >= 0)
@@ -305,27 +311,52 @@ def _read_readings(file: _File, robot: Mechanism, several: bool) -> _File:
     empty = set(np.flatnonzero(absent.all(axis=1)).tolist())
     unread = frozenset(name for name, row in file.first.items() if row in empty)
     read = frozenset(file.first) - unread
-    readings, known = rows, list_columns(robot, ())
-    if controller is not None:
-        readings = np.full(file.readings.shape, np.nan)
-        chosen = [row for name, row in file.first.items() if name in read]
-        if chosen:
-            poses, places = [names[row] for row in chosen], table.places(chosen)
-            solution = solve_commanded_poses(controller, rows[chosen], poses, places)
-            readings[chosen] = solution.q
-        for i, actuator in enumerate(robot.actuators):
-            if actuator.reference is not None and actuator.name in table.units:
-                readings[:, i] = known[actuator.name].parse(table)
+    readings = np.full(file.readings.shape, np.nan)
+    chosen, own = [file.first[name] for name in file.first if name in read], len(columns)
+    if controller is not None and chosen:
+        poses, places = [names[row] for row in chosen], table.places(chosen)
+        solution = solve_commanded_poses(controller, rows[chosen, :own], poses, places)
+        readings[chosen] = solution.q
+    for i, actuator in enumerate(robot.actuators):
+        if actuator.name in table.units and (controller is None or actuator.reference is not None):
+            readings[:, i] = known[actuator.name].parse(table)
+    if chosen and loads and loads[0].name in FORCES:
+        wrench = np.tile(robot.assembly.load.wrench, (len(chosen), 1))
+        wrench[:, [FORCES.index(column.name) for column in loads]] = rows[chosen, own:]
+        for row in np.flatnonzero(absent[chosen].any(axis=1))[:1]:
+            sentence = "the load of a drive depends on all readings and forces, and one is empty"
+            raise table.row_error(chosen[row], f"{sentence}; write it, or leave out this pose")
+        values = robot.values[None]
+        readings[chosen] = load_readings(robot, values, readings[None, chosen], wrench)[0]
     sigma = _read_reading_sigma(table, robot, readings)
     unread = unread if may_be_absent else frozenset[str]()
     return replace(file, readings=readings, sigma=sigma, read=read, unread=unread)
+
+
+def _list_load_columns(table: Table, robot: Mechanism) -> list[str]:
+    """Return the columns that state the loads of elastic drives: these, or the components of the
+    force and moment on the platform.
+    """
+    loads = [a.name for a in robot.actuators if a.name.startswith(LOAD)]
+    forces = [name for name in FORCES if name in table.units]
+    names = [name for name in loads if name in table.units]
+    if names and forces:
+        sentence = f"this file has loads of drives ({names[0]!r}) and of the platform"
+        raise table.header_error(f"{sentence} ({forces[0]!r}); remove one of the two")
+    if not loads or names:
+        names = loads
+    else:
+        stated = (*forces, *robot.assembly.load.stated)
+        names = [name for name in FORCES if name in stated] or ["force.z"]
+    require_columns(table, names, f"of the load on {robot.name}, 0 where there is none")
+    return names
 
 
 def _list_reading_columns(
     table: Table, robot: Mechanism, controller: Mechanism | None
 ) -> list[Column]:
     """Return the columns of the readings, or of the coordinates of the controller."""
-    readings = [actuator.name for actuator in robot.actuators]
+    readings = [a.name for a in robot.actuators if not a.name.startswith(LOAD)]
     if controller is None:
         names, why = readings, f"the reading of an actuator of {robot.name}"
     else:

@@ -15,7 +15,16 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from loopcal.errors import suggest_names
-from loopcal.mechanism.assembly import AXES, Actuator, Address, Joint, Limb, LinearMap
+from loopcal.mechanism.assembly import (
+    AXES,
+    FORCES,
+    Actuator,
+    Address,
+    Joint,
+    Limb,
+    LinearMap,
+    Load,
+)
 from loopcal.mechanism.families.placement import (
     AngleTolerance,
     ErrorModel,
@@ -32,6 +41,7 @@ from loopcal.mechanism.families.placement import (
 )
 from loopcal.mechanism.transmission import (
     HARMONICS,
+    LOAD,
     TABLE,
     TRIANGLE_TERMS,
     compute_range,
@@ -131,8 +141,9 @@ class GivesLength:
     """The known terms of a drive of a slide or rod, and what of it is to be identified.
 
     joint value = offset + scale * reading + curve * (reading / reach)^2 + harmonics of the period +
-    backlash * direction / 2, where reach is the end of the stroke that is farther from zero.
-    `unknown` names terms to identify, with the tolerance `length`.
+    backlash * direction / 2 + compliance * load, where reach is the end of the stroke that is
+    farther from zero, and the load is the force [N] that lengthens the drive. `unknown` names terms
+    to identify, with the tolerance `length`, that of the compliance is `compliances`.
     """
 
     offset: Length = 0.0
@@ -142,13 +153,17 @@ class GivesLength:
     cos1: Length = 0.0
     sin2: Length = 0.0
     cos2: Length = 0.0
+    compliance: Length = 0.0
+    compliances: LengthTolerance | None = None
     unknown: tuple[str, ...] = ()
     length: LengthTolerance | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
 class GivesAngle:
-    """The known terms of a drive of a rotary joint; keys as those of a slide."""
+    """The known terms of a drive of a rotary joint; keys as those of a slide, with a load in
+    Nm.
+    """
 
     offset: Angle = 0.0
     curve: Angle = 0.0
@@ -157,6 +172,8 @@ class GivesAngle:
     cos1: Angle = 0.0
     sin2: Angle = 0.0
     cos2: Angle = 0.0
+    compliance: Angle = 0.0
+    compliances: AngleTolerance | None = None
     unknown: tuple[str, ...] = ()
     angle: AngleTolerance | None = None
 
@@ -258,12 +275,30 @@ Drive = LengthDrive | AngleDrive | SpoolDrive | ScrewDrive | TriangleDrive
 
 @dataclass(frozen=True, kw_only=True)
 class Condition:
-    """A column of the data that is never commanded: `temperature`, `temperature.PLACE` [degC] or
-    `time` [s]. Where none is given it has its `reference`; simulations draw it from its `range`.
+    """A column of the data that is never commanded: `temperature`, `temperature.PLACE` [degC],
+    `time` [s], or of the load `force.AXIS` [N], `moment.AXIS` [Nm]. Where none is given it has its
+    `reference`; simulations draw it from its `range`.
     """
 
     reference: Ratio = 0.0
     range: tuple[Ratio, Ratio] | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class LoadFrame:
+    """Where the load of `conditions:` acts: in `axes` of the base or of the platform, at a point
+    `at` of the platform.
+    """
+
+    axes: Literal["base", "platform"] = "base"
+    at: Point = (0.0, 0.0, 0.0)
+
+    def place(self, stated: Mapping[str, Condition]) -> Load:
+        """Return the load of stated conditions."""
+        own = {name: stated[name] for name in FORCES if name in stated}
+        wrench = tuple(own[name].reference if name in own else 0.0 for name in FORCES)
+        ranges = {name: of.range for name, of in own.items() if of.range is not None}
+        return Load(wrench, ranges, tuple(own), self.axes == "platform", self.at)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -371,6 +406,17 @@ class PlacedDrive:
         return Dimension(self.drive.reads)
 
     @property
+    def load(self) -> Actuator | None:
+        """The load as a reading, where a compliance is stated or unknown."""
+        is_elastic = self.drive.compliance or "compliance" in self.drive.unknown
+        load = Actuator(LOAD + self.own.name, self._load, reference=0.0)
+        return load if is_elastic else None
+
+    @property
+    def _load(self) -> Dimension:
+        return Dimension.MOMENT if self.dimension is Dimension.ANGLE else Dimension.FORCE
+
+    @property
     def _is_like_own(self) -> bool:
         return self.own.dimension is self.reading
 
@@ -399,7 +445,7 @@ class PlacedDrive:
             terms,
             drive.period,
             sigma,
-            self.weights,
+            self.weights or ({name: 1.0} if self.load else {}),
             points,
             drive.interpolation,
         )
@@ -423,6 +469,10 @@ class PlacedDrive:
             if term == "curve":  # without a stroke it is refused where it is stated
                 coefficient = 1 / reach**2 if 0.0 < reach < np.inf else np.nan
             terms[term] = (own, getattr(drive, term), tolerance, term, coefficient)
+        terms["compliance"] = (
+            *(own.per(self._load), drive.compliance, drive.compliances),
+            *("compliance", 1 / self.sense),  # of the joint, whatever moves it
+        )
         for k, (_, value) in enumerate(drive.table, 1):
             terms[f"{TABLE}{k}"] = (own, value, tolerance, f"{TABLE}{k}", 1.0)
         return terms
@@ -454,14 +504,19 @@ class PlacedCoupling:
         return Actuator(self.name, self.dimension, None, terms, weights=self.weights, column=column)
 
 
+def get_condition_dimension(name: str) -> Dimension:
+    """Return the dimension of a condition by its name."""
+    return Dimension.TIME if name == Dimension.TIME.value else Dimension.TEMPERATURE
+
+
 def list_conditions(stated: Mapping[str, Condition]) -> Iterator[Actuator]:
-    """Yield the conditions of a file as readings."""
+    """Yield conditions of a file, but those of the load, as readings."""
     for name, condition in stated.items():
-        dimension = Dimension.TIME if name == Dimension.TIME.value else Dimension.TEMPERATURE
+        dimension = get_condition_dimension(name)
         if dimension.value != name.partition(".")[0]:
             raise RecordError(
-                f"the condition {name!r} is no column of times or temperatures; call it "
-                "temperature, temperature.PLACE or time",
+                f"the condition {name!r} is no column of times, temperatures or loads; call it "
+                f"temperature, temperature.PLACE, time, or one of {', '.join(FORCES)}",
                 "conditions",
                 name,
             )
@@ -499,6 +554,12 @@ def couple_joints(
     couplings: list[PlacedCoupling] = []
     for key, coupling in stated.items():
         name = coupling.condition
+        if name in FORCES:
+            raise CouplingError(
+                f"coupling {key!r} names {name!r}, but a load acts through drives; state the "
+                "`compliance:` of a drive",
+                key,
+            )
         if name and name not in conditions:
             raise CouplingError(
                 f"coupling {key!r} names the condition {name!r}, which the file does not state"
@@ -591,7 +652,8 @@ def coupling_errors(placed: PlacedCoupling) -> ErrorModel:
     terms: dict[str, tuple[Dimension, float, Tolerance, str]]
     terms = {"offset": (placed.dimension, coupling.offset, spread, "offset")}
     if coupling.condition:
-        terms["slope"] = placed.dimension, coupling.slope, coupling.slopes, "gain"
+        per = placed.dimension.per(get_condition_dimension(coupling.condition))
+        terms["slope"] = per, coupling.slope, coupling.slopes, "gain"
     for key, joints, dimension, tolerance in (
         (WEIGHT, coupling.sum, Dimension.RATIO, coupling.weights),
         ("radius", of_radii, Dimension.LENGTH, getattr(coupling, "radii", None)),
@@ -726,6 +788,14 @@ def _check_terms(placed: PlacedDrive) -> PlacedDrive:
         raise DriveError(
             f"actuator {name!r} states a curve, the deviation at the far end of its stroke, but no "
             "stroke; state the stroke",
+            name,
+        )
+    if drive.compliance < 0.0:
+        raise DriveError(f"the compliance of actuator {name!r} is negative; state its size", name)
+    if "compliance" in drive.unknown and drive.compliances is None:
+        raise DriveError(
+            f"the compliance of actuator {name!r} is unknown; state `compliances:`, the tolerance "
+            "of its stated value",
             name,
         )
     if drive.table:

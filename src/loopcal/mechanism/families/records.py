@@ -13,11 +13,12 @@ from dataclasses import dataclass, field, fields, replace
 from typing import ClassVar
 
 from loopcal.errors import MechanismError, suggest_names
-from loopcal.mechanism.assembly import Actuator, Assembly
+from loopcal.mechanism.assembly import FORCES, Actuator, Assembly
 from loopcal.mechanism.families.drives import (
     Condition,
     Coupling,
     Drive,
+    LoadFrame,
     complete_drives,
     couple_joints,
     coupling_errors,
@@ -34,10 +35,12 @@ from loopcal.mechanism.families.placement import (
     PlacedLimb,
     PoseRecord,
     RatioTolerance,
+    RecordError,
     complete_limbs,
     join_errors,
     standard_deviation,
 )
+from loopcal.mechanism.transmission import LOAD
 from loopcal.parameters import CommonError, Parameter
 from loopcal.units import Angle, Dimension, Length
 
@@ -147,7 +150,8 @@ class RobotRecord:
         a common zero.
     drives : by name; in limbs that are numbered, `q` means q1, q2, .. One that is not listed reads
         the joint value. couplings : of driven and passive joints, by name. conditions : data
-        columns in them. parameters : of one's own, with maps onto limbs and drives.
+        columns in them, and the load on the platform. load : where this load acts. parameters : of
+        one's own, with maps onto limbs and drives.
     """
 
     OLDER_KEYS: ClassVar[Mapping[str, tuple[type, str]]] = {"actuators": (dict, "drives")}
@@ -167,6 +171,7 @@ class RobotRecord:
     drives: Mapping[str, Drive] = field(default_factory=dict, hash=False)
     couplings: Mapping[str, Coupling] = field(default_factory=dict, hash=False)
     conditions: Mapping[str, Condition] = field(default_factory=dict, hash=False)
+    load: LoadFrame = field(default_factory=LoadFrame)
     parameters: tuple[NamedParameter, ...] = ()
 
     def expand(self) -> Assembly:
@@ -189,8 +194,9 @@ class RobotRecord:
         errors : the unknowns of the family. own : what the family knows of its drives. complete :
         tolerances of the errors of every link and drive, which are unknown, too, where stated.
         """
-        placed = couple_joints(limbs, self.drives, self.couplings, self.conditions)
-        limbs, couplings = placed
+        columns = {name: of for name, of in self.conditions.items() if name not in FORCES}
+        conditions = tuple(list_conditions(columns))
+        limbs, couplings = couple_joints(limbs, self.drives, self.couplings, columns)
         drives = place_drives(limbs, self.drives, own, couplings)
         rows = {**drives, **{coupling.name: coupling for coupling in couplings}}
         errors = join_errors(
@@ -209,7 +215,11 @@ class RobotRecord:
         return Assembly(
             self.name,
             tuple(limb.limb for limb in limbs),
-            (*(drive.actuator for drive in drives.values()), *list_conditions(self.conditions)),
+            (
+                *(drive.actuator for drive in drives.values()),
+                *conditions,
+                *(load for drive in drives.values() if (load := drive.load)),
+            ),
             freedoms,
             controlled,
             self.home.matrix,
@@ -242,8 +252,21 @@ class RobotRecord:
             raise MechanismError(
                 f"two common errors are called {duplicate[0]!r}; give each its own name"
             )
+        load = self.load.place(self.conditions)
+        is_elastic = any(a.name.startswith(LOAD) for a in expanded.actuators)
+        if not is_elastic and (load.stated or self.load != LoadFrame()):
+            raise RecordError(
+                f"{self.name} states a load, but no drive with a compliance; state a `compliance:` "
+                "under `drives:`",
+                "conditions" if load.stated else "load",
+                *load.stated[:1],
+            )
         return replace(
-            expanded, parameters=parameters, stored_parameters=present, common_errors=common
+            expanded,
+            parameters=parameters,
+            stored_parameters=present,
+            common_errors=common,
+            load=load,
         )
 
 

@@ -18,6 +18,7 @@ from loopcal.errors import MechanismError, suggest_names
 from loopcal.mechanism.assembly import (
     AXES,
     BASE,
+    FORCES,
     Actuator,
     Address,
     Assembly,
@@ -27,6 +28,7 @@ from loopcal.mechanism.assembly import (
 )
 from loopcal.mechanism.families.drives import (
     Drive,
+    LoadFrame,
     NamedTriangleDrive,
     StrokeError,
     drive_errors,
@@ -328,7 +330,8 @@ class PlacedStages(Stages):
                 "has a `family:`",
                 "parameters",
             )
-        if self.couplings or self.conditions:
+        others = [name for name in self.conditions if name not in FORCES]
+        if self.couplings or others:
             raise RecordError(
                 f"{self.name} couples joints of different stages; describe these stages as one "
                 "robot of family limbs, and state `couplings:` there",
@@ -377,6 +380,12 @@ class PlacedStages(Stages):
             raise StageError(
                 f"stage {stage.name!r} states a tool; state it for the whole robot, or as the "
                 "mount of the next stage",
+                i,
+            )
+        if robot.load != LoadFrame() or any(name in FORCES for name in robot.conditions):
+            raise StageError(
+                f"stage {stage.name!r} states a load; state it for the whole robot, whose end "
+                "platform it acts on",
                 i,
             )
         try:
@@ -431,8 +440,9 @@ def expand_joint(
             ),
         )
     )
+    own_readings = (placed.actuator, *([placed.load] if placed.load else []))
     return Assembly(
-        name, (limb.limb,), (placed.actuator,), AXES, (), np.eye(4), errors.parameters, errors.maps
+        name, (limb.limb,), own_readings, AXES, (), np.eye(4), errors.parameters, errors.maps
     )
 
 
