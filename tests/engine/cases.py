@@ -58,7 +58,7 @@ def make_case(robot: Mechanism, t: int = 1, n: int = 5, seed: int = 1) -> Case:
         e *= np.concatenate(
             [np.tile([s.axis not in (0, 1) for s in g.slots], len(g.limbs)) for g in p.groups]
         )
-    steps = [0.03 * p.size if a.dimension.value == "length" else 0.05 for a in robot.actuators]
+    steps = [0.03 * p.size if a.dimension.value == "length" else 0.05 for a in robot.assembly.rows]
     # sums of more lengths than there are readings, or coupled joints
     is_by_joint = robot.has_open_sums or bool(robot.assembly.couplings)
     step = np.array([0.03 * p.size] * p.n_joints if is_by_joint else steps)
