@@ -38,9 +38,9 @@ Array = NDArray[np.float64]
 MM = 1e-3
 
 RELATIVES = {
-    "3-rps", "6-pus", "cable-4", "cable-camera", "hexapod-elastic", "hexapod-nategh-agheli", "hexapod-octahedral",
-    "klann-leg", "linear-delta-6", "orthoglide", "palletizer", "par4", "pulley-3", "rotary-delta",
-    "solar-tracker", "telescopic-delta", "tricept", "warm-delta",
+    "3-rps", "6-pus", "cable-4", "cable-camera", "hexapod-elastic", "hexapod-nategh-agheli",
+    "hexapod-octahedral", "klann-leg", "linear-delta-6", "orthoglide", "palletizer", "par4",
+    "pulley-3", "rotary-delta", "solar-tracker", "telescopic-delta", "tricept", "warm-delta",
 }  # fmt: skip
 """Shipped robots whose closure another shipped robot has, too; here the evidence tests them."""
 

@@ -15,16 +15,7 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from loopcal.errors import suggest_names
-from loopcal.mechanism.assembly import (
-    AXES,
-    FORCES,
-    Actuator,
-    Address,
-    Joint,
-    Limb,
-    LinearMap,
-    Load,
-)
+from loopcal.mechanism.assembly import AXES, FORCES, Actuator, Address, Joint, Limb, LinearMap, Load
 from loopcal.mechanism.families.placement import (
     AngleTolerance,
     ErrorModel,
