@@ -334,3 +334,27 @@ def test_figure_is_shown_in_a_notebook_without_pyplot(five_bar) -> None:
     content, size = draw_convergence(five_bar.fit)._repr_png_()
     assert content.startswith(b"\x89PNG")
     assert size == {"width": 864, "height": 374}
+
+
+@pytest.mark.parametrize(
+    ("subject", "limit", "word"),
+    [
+        ("fit", 1e-4, "conforms"),
+        ("fit", 1e-5, "neither conforms nor fails"),
+        ("robot", 1e-5, "does not conform"),
+    ],
+)
+def test_decision_is_a_number_line_with_error_interval_and_limit(
+    subject, limit, word, hexapod
+) -> None:
+    validation = lc.validate(getattr(hexapod, subject), hexapod.held_out, limit_position=limit)
+    axes = draw_validation(validation).axes[-1]
+    decision = validation.conformity["position"]
+    assert axes.get_title().endswith(f"m: {word}")
+    factor = {"um": 1e6, "mm": 1e3}[axes.get_xlabel().split("[")[1].rstrip("]")]
+    (error,) = (line.get_xdata()[0] for line in axes.lines if line.get_marker() == "o")
+    assert error == pytest.approx(factor * decision.estimate)
+    assert pytest.approx(factor * limit) in [line.get_xdata()[0] for line in axes.lines]
+    words = [text.get_text() for text in axes.texts]
+    assert words == sorted(words, key=["conforms", "undecided", "fails"].index)
+    assert axes.get_xlim()[1] > factor * max(decision.high, limit)

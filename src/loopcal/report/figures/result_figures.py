@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from loopcal.apply.accuracy import AccuracyMap
+from loopcal.apply.conformity import Conformity
 from loopcal.apply.error_budget import ErrorBudget
 from loopcal.apply.height_errors import HeightErrors
 from loopcal.apply.repeatability import DIMENSIONS, Estimate, Repeatability, VisitedPose
@@ -45,7 +46,7 @@ from loopcal.report.figures.style import (
     start_panels,
 )
 from loopcal.results.presenters import register
-from loopcal.results.tables import format_number
+from loopcal.results.tables import choose_unit, format_number
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import DISPLAY_UNITS, Dimension, Unit
 
@@ -259,6 +260,12 @@ def _unit_of(name: str) -> Unit:
 BEFORE, AFTER, LIMIT = COLORS[1], COLORS[0], COLORS[3]
 """Colors of errors before and after calibration, and of a limit."""
 
+GOOD, OPEN, BAD = "#cfeadf", "#f3eccb", "#f6d5c3"
+"""Colors of what a decision rule accepts, leaves open and rejects."""
+
+LEAST_ROOM = 0.12
+"""Share of a number line in which a word fits."""
+
 FEWEST_BARS = 5
 """Kinds of measurement for which there is room, so that the bars of a single one are narrow."""
 
@@ -268,16 +275,22 @@ LOGARITHMIC = 8.0
 
 @register("figure", Validation)
 def draw_validation(validation: Validation) -> Figure:
-    """Draw the errors of each quantity by pose, and those of all kinds over sigma."""
-    quantities = validation.quantities
+    """Draw the errors of each quantity by pose, those of all kinds over sigma, and the decision on
+    each quantity with a limit.
+    """
+    quantities, decisions = validation.quantities, validation.conformity
     has_kinds = validation.has_several_kinds or not quantities
-    n = len(quantities) + has_kinds
-    figure, panels = start_panels(9.5, 1.4 + 2.7 * n, n, 1)
+    n, lines = len(quantities) + has_kinds, len(decisions)
+    heights = {"height_ratios": [2.7] * n + [1.1] * lines}
+    size = (9.5, 1.4 + sum(heights["height_ratios"]))
+    figure, panels = start_panels(*size, n + lines, 1, gridspec_kw=heights)
     limits = {"position": validation.limit_position, "orientation": validation.limit_angle}
     for (axes,), quantity in zip(panels, quantities, strict=False):
         _draw_quantity(axes, validation, quantity, limits.get(quantity))
     if has_kinds:
-        _draw_kinds(panels[-1, 0], validation)
+        _draw_kinds(panels[n - 1, 0], validation)
+    for (axes,), (quantity, conformity) in zip(panels[n:], decisions.items(), strict=True):
+        _draw_decision(axes, quantity, conformity, validation.units[quantity])
     before: dict[str, Any] = {"color": BEFORE, "marker": "s", "mfc": "none", "ms": DOT, "lw": LINE}
     handles = [
         make_handle("before, line: rms", **before),
@@ -291,14 +304,47 @@ def draw_validation(validation: Validation) -> Figure:
     return finish_figure(figure, f"Errors at {poses}, {validation.frame}")
 
 
+def _draw_decision(axes: Axes, quantity: str, conformity: Conformity, unit: Unit) -> None:
+    """Draw the largest error with its interval on a number line, between what is accepted and what
+    is rejected.
+    """
+    unit = choose_unit(unit, [conformity.estimate])
+    ends = ("low", "estimate", "high", "limit", "acceptance_limit", "rejection_limit")
+    low, error, high, limit, accepted, rejected = (
+        getattr(conformity, end) / unit.factor_to_si for end in ends
+    )
+    right = 1.25 * max(value for value in (high, limit, rejected) if np.isfinite(value))
+    for start, end, color, word in (
+        (0.0, accepted, GOOD, "conforms"),
+        (accepted, rejected, OPEN, "undecided"),
+        (rejected, right, BAD, "fails"),
+    ):
+        if (end := min(end, right)) - start > 0.0:
+            axes.axvspan(start, end, color=color, lw=0.0)
+        if end - start > LEAST_ROOM * right:
+            place = (0.5 * (start + end), 0.86)
+            axes.annotate(word, place, va="center", ha="center", fontsize=SMALL, color=DARK)
+    axes.axvline(limit, color=LIMIT, lw=LINE, ls="-.")
+    axes.errorbar(
+        [error], [0.4], xerr=[[error - low], [high - error]], fmt="o", color=AFTER, ms=2 * DOT,
+        lw=2 * LINE, capsize=4.0,
+    )  # fmt: skip
+    axes.set(xlim=(0.0, right), ylim=(0.0, 1.1), yticks=[])
+    interval = " to ".join(f"{end:.{count_decimals(high, 2)}f}" for end in (low, high))
+    numbers = f"{error:.2g} (95 %: {interval}), limit {limit:.3g} {unit.symbol}"
+    title = f"largest {quantity} error {numbers}: {conformity.decision.value}"
+    label_axes(axes, f"largest {quantity} error [{unit.symbol}]", "", title, grid=False)
+
+
 def _draw_quantity(axes: Axes, validation: Validation, quantity: str, limit: float | None) -> None:
     """Draw the size of each error of one quantity at the place of its pose; the axis is logarithmic
     where errors before and after differ by much.
     """
     labels = tuple(dict.fromkeys(validation.poses))
     place = np.array([labels.index(label) + 1 for label in validation.poses], dtype=float)
-    unit, after = validation.units[quantity], validation.after
-    largest = []
+    after = validation.after
+    size_after = [after.statistics(quantity).rms, validation.noise_floor.rms[quantity]]
+    unit, largest = choose_unit(validation.units[quantity], size_after), []
     for errors, marker, color, face in (
         (validation.before, "s", BEFORE, "none"),
         (after, "o", AFTER, AFTER),

@@ -179,6 +179,7 @@ def _list_handles(robot: Mechanism) -> list[Any]:
     has_rods = has_rods or any(actuator.is_triangle for actuator in robot.actuators)
     has_axes = "R" in kinds and not is_planar(robot)
     guide = {"color": "0.4", "lw": 1.0, "ls": (0, (4, 3))}
+    axes = zip("xy" if is_planar(robot) else "xyz", FRAME_COLORS, strict=False)
     rows: list[tuple[str, bool, dict[str, Any]]] = [
         ("axis of a revolute joint", has_axes, {"color": "black", "lw": 1.2}),
         ("guide of a sliding joint", "P" in kinds, guide),
@@ -186,6 +187,7 @@ def _list_handles(robot: Mechanism) -> list[Any]:
         ("driven, filled", True, _dot(marker, "0.4", "0.4")),
         ("platform", True, {"color": "0.25", "lw": 2.0}),
         ("tool", True, _dot("*", "black", "black", 8.0)),
+        *((f"{axis} of base and tool", True, {"color": color, "lw": 1.4}) for axis, color in axes),
     ]
     return [make_handle(label, **style) for label, is_drawn, style in rows if is_drawn]
 
