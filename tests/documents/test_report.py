@@ -213,7 +213,7 @@ def test_many_rows_are_thinned_and_the_report_says_so(run) -> None:
     lengthened = replace(record, residuals=(many,), arrays=arrays)
     text = render_html(build(lengthened, "residuals", "poses", "workspace"))
     assert "The figure shows 3,000 of 120,000 fitted poses." in text
-    assert "The 3-D view can show the robot at 1,129 of these poses, evenly spread." in text
+    assert "The 3-D view can show the robot at 1,025 of these poses, evenly spread." in text
     assert "than every measured pose of the 3,000 that are compared." in text
     assert "The figure shows 3,000 of 120,000 rows." in text
     assert "120,000 fitted poses, of which the first 3,000 are listed" in text
