@@ -584,7 +584,8 @@ def couple_joints(
     that contradict others. Those that the loops contain are left out.
     """
     joints = {joint.name: joint for joint in graph.joints}
-    known = [c for c in couplings if {c.joint, c.leader} <= joints.keys()]
+    plain = {name for name, joint in joints.items() if not joint.is_pin}  # not two joints in one
+    known = [c for c in couplings if {c.joint, c.leader} <= plain]
     if not known:
         return graph, tuple(couplings)
     left = [c for c in couplings if c not in known or not c.factor]

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Joints that follow others, pins of other programs, and files beside a URDF."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -9,7 +11,14 @@ from loopcal.io.formats.import_export import export_robot
 from loopcal.io.formats.linkages import urdf
 from loopcal.io.formats.program_format import ExportSource
 from loopcal.mechanism.solutions import forward, inverse
-from tests.io.formats.linkages.test_urdf_closures import FIVE_BAR, MOTORS, PIN, make_joint, read
+from tests.io.formats.linkages.test_urdf_closures import (
+    BARE,
+    FIVE_BAR,
+    MOTORS,
+    PIN,
+    make_joint,
+    read,
+)
 
 LINKS = "".join(f'<link name="{n}"/>' for n in ("base", "arm1", "rod", "arm2", "tip"))
 FOUR_BAR = (
@@ -247,7 +256,7 @@ THREE = TRANSMISSION.format("j1") + TRANSMISSION.format("j3")
 REFUSED = {
     "two motors": ("RR", {2: (1, 0.5, 0.0)}, "ab", TWO, "'j2' cannot follow 'j1' .* factor 0.5"),
     "no factor": ("RR", {2: (1, 0.0, 0.0)}, "ab", "", "'j2' cannot follow 'j1' .* factor 0"),
-    "unknown leader": ("RR", {2: (7, 1.0, 0.0)}, "ab", "", "'j2' .* 'j7' .* does not move"),
+    "unknown leader": ("RR", {2: (7, 1.0, 0.0)}, "ab", "", "'j2' .* 'j7' .* no motion"),
     "contradiction": ("RRR", {2: (3, 1, 0), 3: (2, 2, 0)}, "abc", "", "'j3' cannot follow 'j2'"),
     "slide elsewhere": ("PRR", {2: (1, 3.0, 0.0)}, "aac", THREE, "'j2' turns with the slide 'j1'"),
 }
@@ -259,6 +268,16 @@ def test_couplings_that_no_machine_has_are_refused(tmp_path, case) -> None:
     text = make_chain(kinds, mimics, parents) + (motors or TRANSMISSION.format("j1")) + "</robot>"
     with pytest.raises(LoopcalError, match=sentence):
         read(tmp_path, text, platform="abcd"[len(kinds)])
+
+
+def test_a_coupled_joint_that_is_half_of_a_pin_is_refused(tmp_path) -> None:
+    pin = make_mimic(make_joint("half", "rod1", "pin1", "0.3 0 0"), "mot1", 0.5)
+    end = make_joint("other_half", "rod2", "end2", "0.3 0 0")
+    text = BARE.replace("</robot>", f'<link name="pin1"/><link name="end2"/>{pin}{end}</robot>')
+    closures = "closed_loop: [[half, other_half]]\ntype: [6d]\nname_mot: [mot1, mot2]\n"
+    with pytest.raises(LoopcalError, match="'half' cannot follow 'mot1'"):
+        read(tmp_path, text, closures)
+    read(tmp_path, re.sub("<mimic[^>]*>", "", text), closures)
 
 
 def test_wrong_closure_of_several_is_named_with_its_gaps(tmp_path) -> None:

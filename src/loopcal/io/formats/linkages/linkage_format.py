@@ -269,7 +269,8 @@ def read(tree: LinkTree, options: ImportOptions, what: str) -> Imported:
         finding = _name_links(mechanism, error.args[0])
         _check_couplings(mechanism, finding.data.get("joints", ()))
         raise tree.error(finding, _find_origin(tree, finding.data.get("joints", ()))) from None
-    _check_couplings(mechanism, [joint.name for joint in paths.graph.joints])
+    moving = [name for j in paths.graph.joints for name in (j.name, j.origin_a, j.origin_b)]
+    _check_couplings(mechanism, moving)
     closing = closures.name if closures is not None else "its constraints"
     what = f"{what} with loop closures in {closing}"
     family = choose_family(paths)
