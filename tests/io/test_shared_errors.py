@@ -289,7 +289,7 @@ def test_a_prior_without_a_session_holds_in_every_session_in_python(tmp_path):
     [
         ("scale: 2 ppm", "write 'scale: {sd: 2 ppm}'"),
         ("scale: {}", "write 'scale: {sd: 2 ppm}'"),
-        ("scale: {mean: 2 ppm}", "has no key 'sd'"),
+        ("scale: {mean: 2 ppm}", "an uncertainty is stated once"),
         ("scale: {sd: 2}", "write a number and one of 1, ppm, um/m"),
         ("scale: {sd: 2 mm}", "write a number and one of 1, ppm, um/m"),
         ("scale: {sd: nan ppm}", "write a number and one of"),
