@@ -225,7 +225,7 @@ def test_figures_show_medians_against_poses_with_their_intervals(result: StudyRe
     ends = [segment[:, 1] for segment in bars.get_segments()]
     np.testing.assert_allclose(ends, [[1e3 * m.low, 1e3 * m.high] for m in medians])
     assert panels[0].get_ylabel() == "position [mm]"
-    assert panels[0].get_xlabel() == "poses [1]"
+    assert panels[0].get_xlabel() == "poses"
 
 
 def test_figures_are_written_by_level_and_refused_where_there_are_too_many_panels(

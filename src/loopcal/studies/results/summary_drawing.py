@@ -16,6 +16,7 @@ from loopcal.report.figures.style import (
     COLORS,
     GRID,
     LABEL,
+    LINE,
     REFERENCE,
     SMALL,
     THIN,
@@ -25,6 +26,7 @@ from loopcal.report.figures.style import (
     start_figure,
 )
 from loopcal.report.pictures import render_figure
+from loopcal.results.tables import choose_unit
 from loopcal.studies.results.questions import FRAMES, UNITS
 from loopcal.studies.results.study_result import CellSummary, Interval, StudySummary, find_columns
 from loopcal.studies.specification.levels import list_chains
@@ -124,7 +126,7 @@ def choose_layout(study: Study, factor: str | None = None) -> Layout:
             words = {level: chain.label for chain in chains for level in chain.levels}
         if first.quantity not in ("count", "factor"):
             label = f"{axis}: {first.quantity}"
-        label = f"{label} [{'1' if first.unit == '1' else unit.symbol}]"
+        label = f"{label} [{unit.symbol}]" if first.unit != "1" else label
     else:
         names = dict.fromkeys(level for chain in chains for level in chain.levels)
         places = {level: float(i) for i, level in enumerate(names)}
@@ -161,14 +163,15 @@ def draw_score(
             "drawn; draw it from summary.csv"
         )
     column = study.columns[place]
-    unit = UNITS[column.unit]
     levels = dict.fromkeys(layout.find_level(cell, layout.color) for cell in summary.cells)
     colors = dict(zip(levels, COLORS, strict=False))  # the same in all panels
     asked = [question for question in study.questions.values() if question.score == score]
     limits = dict.fromkeys(check_question(study, question) for question in asked)
-    lines = [limit / unit.factor_to_si for limit in limits]
     found = {kind: _list_values(summary.cells, score, kind) for kind in STYLES}
     kinds = [kind for kind in STYLES if found[kind]]
+    ends = [interval.value for kind in kinds for _, interval in found[kind]]
+    unit = choose_unit(UNITS[column.unit], [np.median(ends)] if ends else [])
+    lines = [limit / unit.factor_to_si for limit in limits]
     lines += [COVERAGE] if "mean" in kinds else []
 
     columns = min(len(groups), 3)
@@ -189,7 +192,6 @@ def draw_score(
             axes.axhline(y, color=REFERENCE, lw=THIN, ls="--", zorder=1)
     for axes in axes_grid.flat[len(groups) :]:
         axes.set_visible(False)
-    ends = [interval.value for kind in kinds for _, interval in found[kind]]
     if ends and min(ends) > 0.0 and max(ends) > WIDE * min(ends) and "mean" not in kinds:
         scale_logarithmically(axes_grid[0, 0].yaxis)
     _label_places(axes_grid, layout)
@@ -265,7 +267,7 @@ def _draw_points(
     below, above = np.where(is_open_below, 0.0, y - low), np.where(is_open_above, 0.0, high - y)
     # the value of a quantile is interpolated, so that it can lie just outside of its interval
     bars = np.maximum([below, above], 0.0)
-    axes.errorbar(x, y, bars, fmt=style, color=color, ms=4.0, lw=1.0, elinewidth=1.0, capsize=2.0)
+    axes.errorbar(x, y, bars, fmt=style, color=color, ms=6.0, lw=LINE, elinewidth=1.0, capsize=2.5)
     arrow = {"arrowstyle": "<-", "color": color, "lw": 1.0}
     for is_open, length in ((is_open_above, 14), (is_open_below, -14)):
         for point in zip(x[is_open], y[is_open], strict=True):
