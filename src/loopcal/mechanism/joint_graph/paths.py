@@ -172,13 +172,10 @@ def find_limbs(graph: JointGraph, platform: str) -> tuple[GraphLimb, ...]:
         if circle is None:
             break
         inner.append(circle.joints[len(circle.joints) // 2].body_a)
-    order = {motor: i for i, motor in enumerate(graph.motors)}
-    last = len(order)  # passive limbs
-
-    def find_first(limb: GraphLimb) -> int:
-        return min((order.get(joint.drive, last) for joint in limb.joints), default=last)
-
-    return tuple(sorted(limbs, key=find_first))
+    order = {motor: i for i, motor in enumerate(graph.motors)}  # passive limbs last
+    return tuple(
+        sorted(limbs, key=lambda limb: min(order.get(j.drive, len(order)) for j in limb.joints))
+    )
 
 
 def _walk_limbs(joints: Sequence[GraphJoint], nodes: Sequence[str]) -> Iterator[GraphLimb]:

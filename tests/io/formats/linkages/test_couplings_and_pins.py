@@ -178,6 +178,7 @@ def place_chain(kinds: str, values: dict[int, np.ndarray], path: tuple[int, ...]
         ("RRR", "abc", {2: (1, -0.5, 0.1)}, (1, 2, 3)),  # a belt in an arm
         ("RPR", "abc", {2: (1, 0.04, 0.01)}, (1, 2, 3)),  # a pinion
         ("PRR", "abc", {2: (1, 3.0, 0.1)}, (1, 2, 3)),  # a rack
+        ("PPR", "abc", {2: (1, -0.5, 0.01)}, (1, 2, 3)),  # a telescope
         ("RRR", "abc", {3: (2, 2.0, 0.0), 2: (1, 1.5, 0.1)}, (1, 2, 3)),  # one after the other
         ("RRR", "aab", {2: (1, 0.5, 0.1)}, (1, 3)),  # what follows carries nothing
         ("RRR", "aac", {2: (1, 0.5, 0.1)}, (2, 3)),  # the motor is on another branch

@@ -157,7 +157,9 @@ def read_mechanism(tree: LinkTree, path: Path | None) -> Linkage:
     try:
         bodies = weld_bodies(tree.root, welds)
         graph = assemble_graph(tree.root, [bodies.move(joint) for joint in joints], motors)
-        graph, left = couple_joints(graph, _list_couplings(tree))
+        known = tree.joints.values()
+        couplings = [Coupling(j.name, *j.mimic) for j in known if j.mimic is not None and j.kind]
+        graph, left = couple_joints(graph, couplings)
     except MechanismError as error:
         raise _locate_error(error, tree, closures) from None
     rigid = _list_rigid_closures(tree, closures)
@@ -368,15 +370,6 @@ def _build_constraint(tree: LinkTree, constraint: Constraint) -> tuple[Weld | Gr
     return (
         GraphJoint(f"{name}_1", "R", a, cross, A, np.eye(4), first, near),
         GraphJoint(f"{name}_2", "R", cross, b, turn, B, second, "", far),
-    )
-
-
-def _list_couplings(tree: LinkTree) -> tuple[Coupling, ...]:
-    """Return which joints follow others."""
-    return tuple(
-        Coupling(joint.name, *joint.mimic)
-        for joint in tree.joints.values()
-        if joint.mimic is not None and joint.kind
     )
 
 

@@ -547,12 +547,11 @@ def _describe_couplings(paths: LimbPaths) -> Content:
             continue
         scale = 1 / factor if (joint.kind, lead.kind) == ("R", "P") else 1.0
         weights = {names[joint.name]: scale, names[lead.name]: -factor * scale}
-        kinds = dict(zip(weights, (joint.kind, lead.kind), strict=True))
-        law: Content = {"of": "length" if "P" in kinds.values() else "angle", "sum": weights}
-        if {*kinds.values()} == {"R", "P"}:
-            law["sum"] = {name: weight for name, weight in weights.items() if kinds[name] == "P"}
-            law["radius"] = {n: weight for n, weight in weights.items() if kinds[n] == "R"}
-        couplings[joint.name] = law | {"offset": offset * scale, "unknown": ["offset"]}
+        turning = [n for n, of in zip(weights, (joint, lead), strict=True) if of.kind == "R"]
+        law: Content = {"sum": weights, "offset": offset * scale, "unknown": ["offset"]}
+        if len(turning) < 2:  # slides, and rotary joints by their path per radian
+            law |= {"of": "length", "radius": {n: weights.pop(n) for n in turning}}
+        couplings[joint.name] = law
     return {"couplings": couplings} if couplings else {}
 
 
