@@ -13,6 +13,7 @@ from loopcal.estimate.identification import identify
 from loopcal.estimate.penalties import MAP
 from loopcal.estimate.result import Identification
 from loopcal.io.data.measurement_file import load_measurements
+from loopcal.io.robot.robot_file import load_robot, save_robot
 from loopcal.measure.instrument import Gaussian, Instrument, Sensor
 from loopcal.measure.kinds.poses import Pose
 from loopcal.measure.simulation import sample_truth, simulate
@@ -148,3 +149,18 @@ def test_impossible_conditions_are_refused(tmp_path, old, new, said):
     with pytest.raises((FileError, MechanismError)) as refused:
         load_text(tmp_path, changed)
     assert said in str(refused.value)
+
+
+def test_slopes_are_shown_in_units_of_their_own(tmp_path: Path) -> None:
+    for robot, name, symbol, shown in (
+        (load_cached_robot("warm-delta"), "upper1.slope", "um/degC", 4.6),
+        (load_text(tmp_path, BEAM), "drift.slope", "um/s", 1.0),
+    ):
+        i = robot.parameters.names.index(name)
+        assert robot.get_unit(robot.parameters.dimensions[i]).symbol == symbol
+        assert robot.list_shown(robot.values)[i] == pytest.approx(shown)
+        path = tmp_path / "moved.yaml"  # a slope is written and read back in this unit
+        moved = robot.with_values(robot.values * 1.01)
+        save_robot(moved, path)
+        assert_allclose(load_robot(path).values, moved.values, rtol=1e-12)
+        path.unlink()

@@ -9,6 +9,7 @@ from numpy.testing import assert_allclose
 
 from loopcal import geometry
 from loopcal.apply.compensation import compensate
+from loopcal.diagnose.fit_examination import compute_reading_errors
 from loopcal.errors import FileError, MechanismError
 from loopcal.estimate.identification import identify
 from loopcal.estimate.penalties import MAP
@@ -303,3 +304,14 @@ def test_an_elastic_robot_is_shipped_with_units_of_its_compliances() -> None:
     unit = robot.get_unit(robot.parameters.dimensions[-1])
     assert (unit.symbol, unit.factor_to_si) == ("um/N", 1e-6)
     assert robot.parameters.nominal[-1] == pytest.approx(5e-8)
+
+
+def test_reading_errors_are_those_of_commanded_readings() -> None:
+    robot = load_cached_robot(NAME)
+    poses = sample_workspace(robot, 30, seed=7).solution.T
+    sigma = np.repeat([20e-6, 0.0], 6)
+    data = simulate(robot, poses, INSTRUMENT, 3, reading_sigma=sigma)
+    errors = compute_reading_errors(identify(robot, data, MAP()), data)
+    assert errors is not None
+    assert [error.name for error in errors] == [f"q{k}" for k in range(1, 7)]
+    assert all(error.joint == pytest.approx(error.reading) for error in errors)
