@@ -106,6 +106,9 @@ def select_joints(graph: JointGraph, joints: Collection[GraphJoint]) -> JointGra
 MOTION = 1e-9
 """Smallest part of a motion that counts [m, rad]; rounding is below 1e-12."""
 
+ACROSS = 5e-5
+"""Smallest sine between a shift and the normal of its plane that counts [1]."""
+
 
 @dataclass(frozen=True, eq=False)
 class GraphLimb:
@@ -215,16 +218,19 @@ def place_limbs(block: Block, home: FloatArray, T_body_frame: FloatArray) -> Lim
 def _keep_shifts_in_plane(
     graph: JointGraph, home: FloatArray, limbs: tuple[GraphLimb, ...], freedoms: tuple[str, ...]
 ) -> tuple[GraphLimb, ...]:
-    """Return limbs without the shifts normal to their plane, which no equation of it contains."""
-    normals = [AXES[i + 3] for i in range(3) if AXES[i] in freedoms]
-    if len(normals) != 1 or normals[0] in freedoms:
+    """Return limbs without the shifts that no equation contains: those normal to their plane, and
+    of slides alone those across their motions.
+    """
+    turning, free = ([i for i in range(3) if AXES[i + k] in freedoms] for k in (0, 3))
+    if len(turning) > 1 or {*turning} & {*free}:
         return limbs
-    normal = np.eye(3)[AXES[3:].index(normals[0])]
+    moved = [i for i in range(3) if i not in turning] if turning else free
     placement = graph.place(home[None])
 
     def keep(joint: GraphJoint) -> GraphJoint:
         R = (graph.get_place(placement, joint.body_a) @ joint.T_a)[0, :3, :3]
-        across = [a for a in joint.shifts if abs(normal @ R[:, "xyz".index(a)]) < 1 - MOTION]
+        share = np.linalg.norm(R[moved], axis=0)
+        across = [a for a in joint.shifts if share["xyz".index(a)] > ACROSS]
         return replace(joint, shifts="".join(across))
 
     return tuple(replace(limb, joints=tuple(map(keep, limb.joints))) for limb in limbs)
