@@ -25,6 +25,7 @@ from loopcal.io.runs.run_folder import MADE_BY
 from loopcal.measure.kinds import KINDS
 from loopcal.measure.kinds.kind import Column, Kind
 from loopcal.mechanism.families import FAMILIES
+from loopcal.mechanism.families.limb_records import Axis
 from loopcal.mechanism.families.records import RobotRecord
 from loopcal.studies.files.study_file import LEVELS
 from loopcal.studies.specification.levels import Question, Scores
@@ -35,6 +36,7 @@ from tools.markdown import fill_blocks, format_table
 DOCS = Path(__file__).resolve().parent.parent / "docs"
 EXAMPLES = DOCS.parent / "examples" / "exports"
 PAGE, EXPORTS = DOCS / "files.md", DOCS / "exports.md"
+AXIS = file_reference.describe_type(Axis)
 BLOCK = r"made by tools.file_reference: (?P<name>[\w-]+)"
 
 
@@ -69,10 +71,15 @@ def format_record(record: type, without: Iterable[str] = ()) -> str:
     excluded = set(without)
     keys = [key for key in file_reference.list_keys(record) if key.name not in excluded]
     if not any(key.meaning for key in keys):
-        phrases = (f"`{k.name}`: {k.holds}" + f" ({k.default})" * bool(k.default) for k in keys)
+        phrases = (f"`{k.name}`: {_hold(k)}" + f" ({k.default})" * bool(k.default) for k in keys)
         return "; ".join(phrases) + "\n"
-    rows = [(f"`{k.name}`", k.holds, k.default, k.meaning) for k in keys]
+    rows = [(f"`{k.name}`", _hold(k), k.default, k.meaning) for k in keys]
     return format_table(("key", "holds", "default", "meaning"), rows)
+
+
+def _hold(key: file_reference.Key) -> str:
+    """Return what a key holds, with `axis` for a letter with a sign or a vector."""
+    return key.holds.replace(AXIS, "axis")
 
 
 def format_common() -> str:
@@ -108,23 +115,32 @@ def _format_nested(record: type) -> str:
 
 
 def format_kinds() -> str:
-    """Return columns and settings of every kind of measurement."""
-    sections = []
+    """Return columns and settings of every kind of measurement, common settings once."""
+    meanings = {name: _collect_settings(kind) for name, kind in KINDS.items()}
+    counts = Counter(setting for settings in meanings.values() for setting in settings.items())
+    common = {setting: None for setting, count in counts.items() if count > 1}
+    header = ("setting", "meaning")
+    rows = [(f"`{key}`", words) for key, words in common]
+    sections = [f"### Settings of several kinds\n\n{format_table(header, rows)}"]
     for name, kind in KINDS.items():
-        rows = dict.fromkeys(_describe_example(example) for example in kind.examples())
-        columns = format_table(("settings", "columns", "noise is stated for"), rows)
-        meanings = file_reference.collect_meanings(kind)
-        if len(possible := kind.allowed_unknown) > 1:
-            meanings["unknown"] = (
-                f"Which of {', '.join(f'`{p}`' for p in possible)} are unknown, and identified "
-                "with the robot"
-            )
-        settings = format_table(
-            ("setting", "meaning"),
-            [(f"`{key}`", _word(meanings.get(key, ""))) for key in list_kind_settings(kind)],
-        )
-        sections.append(f"### `kind: {name}`\n\n{summarize(kind)}\n\n{columns}\n{settings}")
+        examples = dict.fromkeys(_describe_example(example) for example in kind.examples())
+        parts = [f"### `kind: {name}`\n\n{summarize(kind)}\n"]
+        if any(map(any, examples)):
+            parts += [format_table(("settings", "columns", "noise is stated for"), examples)]
+        shared = [f"`{key}`" for key, words in meanings[name].items() if (key, words) in common]
+        if shared:
+            parts += [f"Common settings: {', '.join(shared)}.\n"]
+        own = [(f"`{k}`", w) for k, w in meanings[name].items() if (k, w) not in common]
+        sections.append("\n".join([*parts, *([format_table(header, own)] if own else [])]))
     return "\n".join(sections)
+
+
+def _collect_settings(kind: type[Kind]) -> dict[str, str]:
+    """Return the meaning of each setting of a kind."""
+    meanings = file_reference.collect_meanings(kind)
+    if len(possible := kind.allowed_unknown) > 1:
+        meanings["unknown"] = f"Which of {', '.join(f'`{p}`' for p in possible)} the fit estimates"
+    return {key: _word(meanings.get(key, "")) for key in list_kind_settings(kind)}
 
 
 def _word(meaning: str) -> str:
@@ -147,7 +163,8 @@ def _describe_example(kind: Kind) -> tuple[str, str, str]:
                 f"`{field.name}: "
                 f"{value if isinstance(value, str) else '[' + ', '.join(value) + ']'}`"
             )
-    return ", ".join(stated), _describe_columns(kind.columns), _describe_columns(kind.noise_columns)
+    columns, noise = _describe_columns(kind.columns), _describe_columns(kind.noise_columns)
+    return ", ".join(stated), columns, "the columns" if noise and noise == columns else noise
 
 
 def _describe_columns(columns: Iterable[Column]) -> str:
