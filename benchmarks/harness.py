@@ -121,7 +121,7 @@ def find_faults(metric: Metric, baseline: dict[str, dict[str, Any]]) -> list[str
         return faults
     if metric.name not in baseline:
         faults.append(
-            f"{shown} and has no baseline; run `make bench-update` and commit "
+            f"{shown} and has no baseline. Run `make bench-update` and commit "
             "benchmarks/baseline.json"
         )
         return faults

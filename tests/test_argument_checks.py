@@ -54,11 +54,11 @@ def test_a_stated_value_is_finite(value):
 @pytest.mark.parametrize(
     ("call", "words"),
     [
-        (lambda fit, data: lc.validate(fit, data, limit_angle=-1.0), "limit_angle is -1.0; give"),
-        (lambda fit, data: lc.validate(fit, data, np.nan), "limit_position is nan; give"),
-        (lambda fit, data: lc.CalibrationOptions(hold_out=0.2, seed=-1), "seed is -1; give"),
-        (lambda fit, data: data.split(hold_out=0.2, seed=-1), "seed is -1; give"),
-        (lambda fit, data: lc.sample_truth(fit.robot, 1, -1), "seed is -1; give"),
+        (lambda fit, data: lc.validate(fit, data, limit_angle=-1.0), "limit_angle is -1.0. Give"),
+        (lambda fit, data: lc.validate(fit, data, np.nan), "limit_position is nan. Give"),
+        (lambda fit, data: lc.CalibrationOptions(hold_out=0.2, seed=-1), "seed is -1. Give"),
+        (lambda fit, data: data.split(hold_out=0.2, seed=-1), "seed is -1. Give"),
+        (lambda fit, data: lc.sample_truth(fit.robot, 1, -1), "seed is -1. Give"),
         (lambda fit, data: lc.identifiability(fit.robot, data, 2.0), "rank_tolerance is 2.0"),
         (lambda fit, data: lc.sample_workspace(lc.load_robot("five-bar"), -1), "-1 positions"),
         (lambda fit, data: lc.find_outliers(fit, hexapod_data(9)), "9 poses, .* made from 12"),
@@ -70,7 +70,7 @@ def test_a_stated_value_is_finite(value):
         ),
         (
             lambda fit, data: lc.save_robot(fit.robot, "a.yaml", np.ones(1)),
-            r"shape \(1,\); give one unc",
+            r"shape \(1,\). Give one unc",
         ),
         (lambda fit, data: lc.FitOptions(excluded_poses=(3,)), "excluded_poses: .*'3'"),  # pyright: ignore
         (lambda fit, data: lc.load_run("a\0b"), "path .* contains a null character"),
@@ -95,6 +95,6 @@ def test_a_value_out_of_range_is_refused_with_what_is_allowed(call, words):
     ],
 )
 def test_robot_and_data_in_the_wrong_order_are_named(robot, data, tmp_path, call):
-    with pytest.raises(lc.DataError, match="robot: got a Measurements; give Mechanism"):
+    with pytest.raises(lc.DataError, match=r"robot: got a Measurements. Give Mechanism"):
         call(robot, data, tmp_path)
     assert list(tmp_path.iterdir()) == []

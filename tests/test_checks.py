@@ -51,12 +51,12 @@ def test_limits_are_of_settings_and_their_defaults_are_allowed(record, needed) -
 
 @pytest.mark.parametrize("wrong", [{"seed": -1}, {"replicates": 0}, {"block": 0}, {"block": 2001}])
 def test_numbers_of_a_study_are_refused_as_those_of_its_file(wrong) -> None:
-    with pytest.raises(ValueError, match=f"{next(iter(wrong))} is .*; it must be from"):
+    with pytest.raises(ValueError, match=f"{next(iter(wrong))} is .*, but must be from"):
         Study(title="wrong", robots={}, **wrong)
 
 
 def test_wrong_word_names_the_option_what_is_allowed_and_what_is_similar() -> None:
-    words = r"mode is 'reading' \(did you mean 'readings'\?\); it must be one of 'readings', 'x'"
+    words = r"mode is 'reading' \(did you mean 'readings'\?\), but must be one of 'readings', 'x'"
     with pytest.raises(EstimationError, match=words):
         check_choice("mode", "reading", ("readings", "x"))
     check_choice("mode", "x", ("readings", "x"))
@@ -72,5 +72,5 @@ def test_limit_refuses_with_the_error_of_its_record() -> None:
         share: float | None = None
 
     Settings()
-    with pytest.raises(DataError, match=r"^share is 1\.5; it must be below 1$"):
+    with pytest.raises(DataError, match=r"^share is 1\.5, but must be below 1$"):
         Settings(1.5)

@@ -40,7 +40,7 @@ def test_entries_of_registries_have_the_names_of_their_keys() -> None:
 
 @pytest.mark.parametrize("registry", [KINDS, FORMATS, LOSSES, METHODS, RULES, FAMILIES])
 def test_an_unknown_name_is_refused_with_the_known_ones(registry) -> None:
-    with pytest.raises(UnknownNameError, match="known are " + ", ".join(registry)):
+    with pytest.raises(UnknownNameError, match="Known: " + ", ".join(registry)):
         registry["cauchy"]
     assert registry.get("cauchy") is None
     assert "cauchy" not in registry
@@ -154,7 +154,7 @@ def test_settings_may_stand_beside_the_name_of_their_method() -> None:
 @pytest.mark.parametrize(
     ("plain", "sentence"),
     [
-        ({"loss": "cauchy"}, "'cauchy' is not a loss; known are huber, tukey"),
+        ({"loss": "cauchy"}, "'cauchy' is not a loss. Known: huber, tukey"),
         ({"method": "rigde"}, "not a method .*did you mean 'ridge'"),
         ({"method": {"lam": 1.0}}, "names no method"),
         ({"loss": {"name": "huber", "c": 2.0}}, "the loss huber has no setting 'c'; it has k"),

@@ -18,7 +18,7 @@ def check_choice(
     words = tuple(allowed)
     if not isinstance(value, str) or value not in words:
         raise error(
-            f"{name} is {value!r}{suggest_names(str(value), words)}; it must be one of "
+            f"{name} is {value!r}{suggest_names(str(value), words)}, but must be one of "
             f"{', '.join(map(repr, words))}"
         )
 
@@ -59,7 +59,7 @@ class Limited:
         for name, limit in self.LIMITS.items():
             value = getattr(self, name)
             if value is not None and not limit.is_allowed(value):
-                raise self.ERROR(f"{name} is {limit.show(value)}; it must be {limit.words}")
+                raise self.ERROR(f"{name} is {limit.show(value)}, but must be {limit.words}")
 
 
 @cache

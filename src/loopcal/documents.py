@@ -251,7 +251,7 @@ def check_browser(output: Path) -> str:
     browser = find_browser()
     if browser is None:
         raise FileError(
-            "a PDF file needs Chromium or Google Chrome, and neither is installed; install one, or "
+            "a PDF file needs Chromium or Google Chrome, and neither is installed. Install one, or "
             "open the HTML file in a browser and print it",
             output,
         )
@@ -280,12 +280,12 @@ def print_pdf(page: Path, output: Path) -> None:
             )
         except subprocess.TimeoutExpired:
             raise FileError(
-                f"{browser} did not print within {SECONDS} s; open the HTML file and print it",
+                f"{browser} did not print within {SECONDS} s. Open the HTML file and print it",
                 output,
             ) from None
         if ended.returncode or not printed.is_file():
             raise FileError(
-                f"{browser} could not print (exit code {ended.returncode}); open the HTML file in "
+                f"{browser} could not print (exit code {ended.returncode}). Open the HTML file in "
                 "a browser and print it",
                 output,
             )

@@ -310,9 +310,8 @@ def check_order(order: str) -> None:
     """Refuse an order that is none of EULER_ORDERS; raises DataError."""
     if order not in EULER_ORDERS:
         raise DataError(
-            f"the Euler order {order!r} is not one of the 24: use {', '.join(_SEQUENCES)} for "
-            "rotations about fixed axes, or the same in capitals for rotations about the moving "
-            "axes"
+            f"the Euler order {order!r} is not one of the 24: use {', '.join(_SEQUENCES)} "
+            f"for rotations about fixed axes, or capitals for rotations about the moving axes"
         )
 
 
@@ -552,7 +551,7 @@ def parse_orientation(name: str) -> OrientationForm:
         return _SIMPLE[name]
     if not name.startswith("euler-"):
         raise DataError(
-            f"unknown orientation form {name!r}; use {', '.join(_SIMPLE)}, or euler- and an order "
+            f"unknown orientation form {name!r}. Use {', '.join(_SIMPLE)}, or euler- and an order "
             "such as euler-xyz"
         )
     order = name.removeprefix("euler-")

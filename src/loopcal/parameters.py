@@ -77,7 +77,7 @@ class ParameterTable:
         if len(self._places) < len(self.entries):
             duplicate = next(name for name in self.names if self.names.count(name) > 1)
             raise MechanismError(
-                f"duplicate parameter {duplicate!r}; give every parameter its own name"
+                f"duplicate parameter {duplicate!r}. Give every parameter its own name"
             )
 
     def __len__(self) -> int:
@@ -170,7 +170,7 @@ def match_names(names: Sequence[str], pattern: str) -> list[str]:
     fitting = [name for name in names if fnmatchcase(name, pattern)]
     if not fitting:
         raise DataError(
-            f"no parameter is named {pattern!r}{suggest_names(pattern, names)}; correct the name; "
+            f"no parameter is named {pattern!r}{suggest_names(pattern, names)}. Correct the name; "
             "a pattern such as 'leg*.length' names several"
         )
     return fitting

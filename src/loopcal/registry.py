@@ -69,7 +69,7 @@ class Registry(Mapping[str, T]):
         if not isinstance(name, str) or not name:
             raise DataError(f"{entry!r} has no name; a {self.noun} needs the attribute 'name'")
         if name in self._places or name in self.aliases:
-            raise DataError(f"{name!r} is the name of a {self.noun} of loopcal; choose another")
+            raise DataError(f"{name!r} is the name of a {self.noun} of loopcal. Choose another")
         self._registered[name] = entry  # type: ignore[assignment]  # what is registered is a T
         return entry
 
@@ -84,7 +84,7 @@ class Registry(Mapping[str, T]):
         if name in self._places or name in self._registered or name in self._offered:
             return name
         hint = suggest_names(str(name), self)
-        raise UnknownNameError(f"{name!r} is not a {self.noun}{hint}; known are {', '.join(self)}")
+        raise UnknownNameError(f"{name!r} is not a {self.noun}{hint}. Known: {', '.join(self)}")
 
     def __getitem__(self, name: str) -> T:
         name = self.resolve(name)

@@ -168,14 +168,14 @@ def find_unit(symbol: str, dimension: Dimension | None = None) -> Unit:
     known, allowed = UNITS.get(symbol), list_symbols(dimension)
     if known is None:
         raise UnitError(
-            f"unknown unit {symbol!r}{suggest_names(symbol, allowed)}; allowed are "
+            f"unknown unit {symbol!r}{suggest_names(symbol, allowed)}. Allowed: "
             f"{', '.join(allowed)}"
         )
     if dimension is not None and known.dimension is not dimension:
         needed = ARTICLES.get(dimension, f"a {dimension.value}")
         raise UnitError(
-            f"{symbol!r} is a unit of {known.dimension.value}, but {needed} is needed; "
-            f"allowed are {', '.join(allowed)}"
+            f"{symbol!r} is a unit of {known.dimension.value}, but {needed} is needed. "
+            f"Allowed: {', '.join(allowed)}"
         )
     return known
 
@@ -201,15 +201,15 @@ def parse_quantity(text: str, dimension: Dimension | None = None) -> float:
     stripped, example = text.strip(), EXAMPLES[dimension or Dimension.LENGTH]
     number = NUMBER.match(stripped)
     if number is None:
-        raise UnitError(f"{text!r} is not a number with a unit; write for example {example}")
+        raise UnitError(f"{text!r} is not a number with a unit. Write for example {example}")
     value, symbol = float(number[0]), stripped[number.end() :].strip()
     if not math.isfinite(value):
         raise UnitError(
-            f"{text!r} is not finite; write a finite number with a unit, for example {example}"
+            f"{text!r} is not finite. Write a finite number with a unit, for example {example}"
         )
     if not symbol:
         raise UnitError(
-            f"{text!r} has no unit; add one of {', '.join(list_symbols(dimension))}, for example "
+            f"{text!r} has no unit. Add one of {', '.join(list_symbols(dimension))}, for example "
             f"{example}"
         )
     return to_si(value, find_unit(symbol, dimension))
@@ -227,7 +227,7 @@ def to_si(value: float, unit: Unit) -> float:
             f"{value:g}" if isinstance(value, float) else f"a number of {len(str(value))} digits"
         )
         raise UnitError(
-            f"{shown} {unit} is beyond {LARGEST:g} {SI_SYMBOLS[unit.dimension]}; write a number "
+            f"{shown} {unit} exceeds {LARGEST:g} {SI_SYMBOLS[unit.dimension]}. Write a number "
             "that a machine can have"
         )
     return value * unit.factor_to_si

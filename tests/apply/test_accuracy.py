@@ -183,10 +183,10 @@ def test_unreachable_poses_have_nan_uncertainty(fit):
 
 def test_unknown_frame_option_is_refused(fit):
     with pytest.raises(
-        EstimationError, match="axes is 'world'; it must be one of 'base', 'platform'"
+        EstimationError, match="axes is 'world', but must be one of 'base', 'platform'"
     ):
         pose_uncertainty(fit, TEST_POSES, "world")  # pyright: ignore[reportArgumentType]
-    names = "it must be one of 'fitted', 'base', 'relative', 'frame'"
+    names = "but must be one of 'fitted', 'base', 'relative', 'frame'"
     with pytest.raises(EstimationError, match=f"frame is 'world'.*; {names}"):
         pose_uncertainty(fit, TEST_POSES, frame="world")
 

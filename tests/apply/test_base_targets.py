@@ -261,7 +261,7 @@ def test_targets_on_the_base_in_another_order_or_unit_are_refused(order, unit):
     (rows,) = data.base_observations
     measured = (rows.measured.reshape(-1, 3, 3)[:, order] / unit).reshape(rows.measured.shape)
     wrong = replace(data, base_observations=(replace(rows, measured=measured),))
-    with pytest.raises(DataError, match="stated places") as caught:
+    with pytest.raises(DataError, match="distances in the file") as caught:
         lc.calibrate(ROBOT, wrong)
     assert caught.value.code == "residuals.base-targets-moved"
 

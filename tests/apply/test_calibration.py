@@ -210,15 +210,15 @@ REFUSED = {
     "CalibrationOptions": lambda: calibrate(hexapod(), hexapod_data(4), 0.25),
     "workflow.free-limb-needs-prior": lambda: CalibrationOptions(free_limb="leg3"),
     "hold_out is 1, which is not a share": lambda: CalibrationOptions(hold_out=1.0),
-    "give one of the two": lambda: CalibrationOptions(hold_out=0.25, held_out=("1",)),
-    r"held_out is the text '1'; .*\['1'\]": lambda: CalibrationOptions(held_out="1"),
-    "limit_position is nan; give a number of metres": (
+    "Give one of the two": lambda: CalibrationOptions(hold_out=0.25, held_out=("1",)),
+    r"held_out is the text '1'. Give .*\['1'\]": lambda: CalibrationOptions(held_out="1"),
+    "limit_position is nan. Give a number of metres": (
         lambda: CalibrationOptions(hold_out=0.25, limit_position=float("nan"))
     ),
     "workflow.limit-needs-held-out-poses": (
         lambda: calibrate(hexapod(), hexapod_data(20), CalibrationOptions(limit_position=1e-3))
     ),
-    "held-out poses have no measured value, or are excluded": (
+    "all held-out poses are empty or excluded": (
         lambda: calibrate(
             hexapod(),
             hexapod_data(20),
@@ -355,7 +355,7 @@ def test_unreachable_poses_are_reported_without_held_out_poses(robot, data) -> N
 
 def test_readings_without_a_finite_sigma_leave_no_equation(robot, data) -> None:
     unread = replace(data, reading_sigma=np.full(data.readings.shape, np.inf))
-    with pytest.raises(lc.EstimationError, match="because the readings are uncertain") as error:
+    with pytest.raises(lc.EstimationError, match="Because the readings are uncertain") as error:
         calibrate(robot, unread)
     assert error.value.code == "fit.no-equation-left"
 

@@ -132,7 +132,7 @@ def test_invalid_compensation_arguments_are_refused():
     robot = load_robot("3-prs")
     with pytest.raises(DataError, match=r"mode is 'poses'.*must be one of 'readings', 'commands'"):
         compensate(robot, [[0.7, 0, 0]], "poses")  # pyright: ignore[reportArgumentType]
-    with pytest.raises(DataError, match="steps is 0; it must be 1 or more"):
+    with pytest.raises(DataError, match="steps is 0, but must be 1 or more"):
         compensate(robot, [[0.7, 0, 0]], "commands", steps=0)
     with pytest.raises(DataError, match="a target of shape"):
         compensate(robot, [[0.7, 0.0]])

@@ -125,7 +125,7 @@ def test_unknown_noise_without_held_out_points_leaves_the_current_values(printer
     report = lc.calibrate(printer, few, lc.CalibrationOptions(check_conventions=False))
     assert report.recommendation.code == "values.keep-undecided"
     assert report.start.finding.code == "residuals.start-needs-sigma"
-    assert "the noise is not known well enough" in str(report)
+    assert "the noise is too uncertain" in str(report)
     assert "Use the calibrated geometry" not in str(report)
 
 

@@ -74,7 +74,7 @@ def test_run_folder_knows_which_frames_are_open(robot, tmp_path) -> None:
     report = lc.calibrate(robot, fitted)
     save_run(report, tmp_path / "run")
     run = load_run(tmp_path / "run")
-    with pytest.raises(lc.DataError, match=r"43 and 44\. The fitted poses do not determine"):
+    with pytest.raises(lc.DataError, match=r"43 and 44\. The fitted poses determine"):
         validate(
             run.identified_robot,
             other,

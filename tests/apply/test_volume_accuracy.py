@@ -173,8 +173,8 @@ def test_a_limit_is_judged_by_the_drawn_errors() -> None:
 @pytest.mark.parametrize(
     ("wrong", "words"),
     [
-        (Volume, "states nothing"),
-        (lambda: Volume(BOX, points=[[0.0, 0.0, 0.1]]), "beside other parts"),
+        (Volume, "contains nothing"),
+        (lambda: Volume(BOX, points=[[0.0, 0.0, 0.1]]), "with other parts"),
         (lambda: Volume({"x": (0.1, 0.1)}), "lower end first"),
         (lambda: Volume({"x": (0.0, np.nan)}), "lower end first"),
         (lambda: Volume({"x": (0.0, 0.1)}, {"x": [0.0]}), "one range"),
@@ -190,8 +190,8 @@ def test_a_limit_is_judged_by_the_drawn_errors() -> None:
         (lambda: [[0.0, 0.0]], "x, y, z"),
         (lambda: [[0.0, 0.0, np.nan]], "points of the volume"),
         (list, "points of the volume"),
-        (lambda: parse_volume_part("x"), "no part of a volume"),
-        (lambda: parse_volume_part("x=1mm..2mm..3mm"), "no range"),
+        (lambda: parse_volume_part("x"), "nor a part of a volume"),
+        (lambda: parse_volume_part("x=1mm..2mm..3mm"), "not a range"),
         (lambda: parse_volume_part("theta=1mm"), "angle"),
         (lambda: join_volume([("x", [0.0]), ("x", (0.0, 1.0))]), "twice"),
     ],

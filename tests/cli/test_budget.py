@@ -64,13 +64,13 @@ def test_the_largest_error_in_a_volume_is_stated_for_all_points_and_for_each(loo
     assert stated["refinement"] < 0.01
     wrong = {
         "z=1m..9m": "reaches no point",
-        "x": "no part of a volume; give x=-40mm..40mm",
-        "x=3mm..2mm": "no range",
+        "x": "nor a part of a volume. Give x=-40mm..40mm",
+        "x=3mm..2mm": "not a range",
         "x=3..4": "no unit",
         "w=1deg..2deg": "x",
         "x=3mm,2deg": "deg",
         "radius=0mm": "above 0",
-        "no-file.csv": "no file",
+        "no-file.csv": "neither a file",
     }
     for text, words in wrong.items():
         assert main(["accuracy", str(run), "--volume", text]) == 1
@@ -125,6 +125,6 @@ def test_residuals_that_contradict_the_noise_state_no_error_in_a_volume(loopcal,
     content = json.loads(path.read_text())
     volume = "--volume x=-1mm..1mm"
     path.write_text(json.dumps({**content, "states_expected_error": False}))
-    loopcal(f"accuracy doubtful {volume}", "the residuals exceed the stated noise", code=1)
+    loopcal(f"accuracy doubtful {volume}", "the residuals exceed the given noise", code=1)
     path.write_text(json.dumps({**content, "verdict": "not_calibrated", "reasons": ["residuals"]}))
     loopcal(f"accuracy doubtful {volume}", "doubtful", code=1)

@@ -108,7 +108,7 @@ def test_noise_that_is_assumed_beside_a_stated_one_is_on_screen_and_in_json(
     loopcal, words, quantity, sigma
 ) -> None:
     printed = loopcal(f"{words} --json")
-    text = f"The standard deviation of each measured {quantity} is not stated: {sigma} is assumed."
+    text = f"Each measured {quantity} has no standard deviation in the file. Assumed: {sigma}."
     assert printed.err.count(text) == 1
     (finding,) = printed.json["input_findings"]
     assert (finding["code"], finding["text"]) == ("data.sigma-assumed", text)
@@ -155,7 +155,7 @@ def test_validate_needs_measurements_that_were_not_fitted(loopcal) -> None:
     # noise of 5 urad leaves a limit of 1 urad open; less noise shows that it is missed
     loopcal("validate run again.csv --limit-angle 1urad", "accepts estimates to 0 deg")
     loopcal(f"{SIMULATE.replace('5urad', '0.5urad')} --force")
-    loopcal("validate run again.csv --limit-angle 1urad", "it does not conform", code=2)
+    loopcal("validate run again.csv --limit-angle 1urad", "does not conform", code=2)
 
 
 def test_calibration_from_a_corrected_robot_file_gives_the_same_estimate(loopcal) -> None:
@@ -216,7 +216,7 @@ def test_heights_alone_cannot_determine_all_parameters(loopcal) -> None:
 
 
 def test_identifiability_states_assumptions_of_suggestions_beside_these_only(loopcal) -> None:
-    assumption = "Suggested measurements are assumed"
+    assumption = "Suggested measurements assume"
     assert assumption not in loopcal("identifiability five-bar --draw 9").out  # lists none
     said = " ".join(loopcal("identifiability gripper --draw 9 --verbose").out.split())
     assert assumption in said
@@ -317,7 +317,7 @@ def test_simulate_keeps_the_names_of_poses(loopcal, tmp_path) -> None:
     (tmp_path / "twice.csv").write_text("\n".join([*lines, lines[1]]) + "\n")
     loopcal(
         "simulate hexapod-42 --poses twice.csv -o other.csv",
-        "pose 'home' is also row 1; give each pose a name of its own",
+        "pose 'home' is also row 1. Give each pose a separate name",
         code=1,
     )
     assert not (tmp_path / "other.csv").exists()
@@ -355,7 +355,7 @@ def test_check_shows_a_robot_without_unknowns(loopcal, tmp_path) -> None:
     bare = "\n".join(line.split(", unknown:")[0] + "}" * (", unknown:" in line) for line in kept)
     (tmp_path / "bare.yaml").write_text(bare)
     for words in ("check bare.yaml", "check bare.yaml --expand"):
-        loopcal(words, "names no unknown")
+        loopcal(words, "has no unknown")
     loopcal("identifiability bare.yaml", "no free parameter", code=1)
 
 

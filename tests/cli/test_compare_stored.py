@@ -55,7 +55,7 @@ def test_towers_in_another_frame_are_named(loopcal) -> None:
     Path("turned.yaml").write_text(text.replace("[210, 330, 90]", "[211, 331, 91]"), "utf-8")
     loopcal(
         f"{CALIBRATE} --compare turned.yaml",
-        "stored value of tower3.angle is 91 deg, but this fit keeps it at 90 deg",
+        "stored value of tower3.angle is 91 deg, but this fit fixes it at 90 deg",
         "all towers of a delta rotated",
         code=1,
     )

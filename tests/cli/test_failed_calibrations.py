@@ -116,7 +116,7 @@ def test_robot_file_states_elsewhere_that_its_calibration_failed(loopcal, folder
     shutil.copy(Path("failed", FAILED_ROBOT), "taken.yaml")
     for words in ("compensate taken.yaml targets.csv", "export taken.yaml -o taken.json"):
         _, out, err = loopcal(words, code=2)
-        assert "taken.yaml is not calibrated. Its numbers must not be used on a machine" in err
+        assert "taken.yaml is not calibrated. Do not load its values into a machine" in err
         assert "pose" not in out
         loopcal(f"{words} --force", code=2)
 
@@ -219,8 +219,8 @@ def test_import_does_not_correct_a_file_where_the_calibration_failed(loopcal, ca
     write_printer(wrong=3.0)
     capsys.readouterr()
     _, out, err = loopcal(IMPORT, code=2)
-    assert "corrected.cfg was not written" in err
-    assert "residuals exceed the stated noise" in err
+    assert "loopcal did not write corrected.cfg" in err
+    assert "residuals exceed the given noise" in err
     assert "use --force" in err
     assert "Written" not in out
     assert not Path("corrected.cfg").exists()

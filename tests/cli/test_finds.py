@@ -61,7 +61,7 @@ FINDS = {
     "known position of 1e308 mm": (
         "import s.json --format hangprinter -o new.yaml",
         {"s.json": SAMPLES.read_text("utf-8").replace("-0.72", "-1e308", 1)},
-        "'xyz_of_samp' contains a number beyond 1e+09; correct it",
+        "'xyz_of_samp' contains a number above 1e+09. Correct it",
     ),
     "output of no study": (
         "reproduce -o out",
@@ -71,17 +71,17 @@ FINDS = {
     "anchor that is used again": (
         "check robot.yaml",
         {"robot.yaml": "a: &x 1\nb: &x 2\nc: *x\n"},
-        "robot.yaml: this file states no format",
+        "robot.yaml: this file has no format",
     ),
     "key that is a mapping in a list": (
         "check robot.yaml",
         {"robot.yaml": "format: 1\nlegs:\n  ? [{a: 1}]\n  : 2\n"},
-        "robot.yaml:3: a key is a list or a mapping; write text there",
+        "robot.yaml:3: a key is a list or a mapping. Write text there",
     ),
     "key that an alias makes a mapping": (
         "check robot.yaml",
         {"robot.yaml": "format: 1\nlegs: &x {a: 1}\n*x : 2\n"},
-        "robot.yaml:3: a key is a list or a mapping; write text there",
+        "robot.yaml:3: a key is a list or a mapping. Write text there",
     ),
     "format of times that states the year twice": (
         "import e.txt --profile p.yaml -o new.csv",
@@ -97,12 +97,12 @@ FINDS = {
             "e.txt": (EXPORTS / "tracker-points.txt").read_text("utf-8"),
             "p.yaml": (EXPORTS / "tracker-points.yaml").read_text("utf-8").replace("SMR2", "'[a'"),
         },
-        "the measured value '[a.x' cannot be the name of a column",
+        "the measured value '[a.x' is not a valid name of a column",
     ),
     "measurements with such a target": (
         "identifiability linear-delta d.csv",
         {"d.csv": "# targets: [a, 'b]']\n" + POSITION + ROWS},
-        "the measured value 'b].x' cannot be the name of a column",
+        "the measured value 'b].x' is not a valid name of a column",
     ),
     "closure of a list": (
         "import r.urdf --closures c.yaml -o new.yaml",
@@ -150,7 +150,7 @@ def test_document_of_a_result_folder_is_never_replaced_by_a_file(loopcal, tmp_pa
     other.write_text('{"files": 3}', "utf-8")
     before = document.read_bytes()
     words = ["export", "five-bar", "--format", "json", "--force", "-o"]
-    loopcal([*words, str(document)], "whose folder cannot be read without it", code=1)
+    loopcal([*words, str(document)], "whose folder needs it", code=1)
     assert document.read_bytes() == before
     loopcal([*words, str(other)])
 

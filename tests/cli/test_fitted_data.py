@@ -72,7 +72,7 @@ def test_prior_refuses_fitted_rows_whatever_their_file_looks_like(loopcal, capsy
         err = loopcal(
             ["calibrate", "hexapod-42", *names, "-o", "run2", "--prior", "run"], code=1
         ).err
-        assert err.startswith("loopcal: The earlier calibration used "), (names, err)
+        assert err.startswith("loopcal: The earlier calibration already contains "), (names, err)
         is_partly_new = names in (["superset.csv"], ["new.csv", "old.csv"])
         assert ("--drop POSE" in err) == is_partly_new  # else nothing would be left
     loopcal("calibrate hexapod-42 new.csv -o run2 --prior run")

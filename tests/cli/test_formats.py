@@ -161,12 +161,12 @@ def test_existing_file_is_replaced_only_with_force(loopcal, folder, data_folder)
     ("command", "sentence"),
     [
         ("import no.cfg -o x.yaml", "no.cfg: this printer.cfg does not exist"),
-        ("import a.txt -o x.yaml", "the format of this file is not known by its ending"),
+        ("import a.txt -o x.yaml", "the ending of this file belongs to no known format"),
         ("import a.csv -o x.yaml", "loopcal writes the format csv, but cannot read it"),
         ("import a.csv -o x.yaml", "an instrument's export with a profile (--profile"),
         (
             "import a.cfg -o x.yaml --corrected y.cfg",
-            "state where to write them, such as --data data.csv",
+            "Name a file for them, such as --data data.csv",
         ),
         ("import a.cfg -o x.yaml --unit mm", "--unit does not belong to the format klipper"),
         (
@@ -178,7 +178,7 @@ def test_existing_file_is_replaced_only_with_force(loopcal, folder, data_folder)
             "is not a robot of the family linear-delta",
         ),
         ("export linear-delta --format linuxcnc -o x.hal", "is not a hexapod of the family gough"),
-        ("export linear-delta -o x.csv --into y.csv", "the format csv is written as a new file"),
+        ("export linear-delta -o x.csv --into y.csv", "the format csv makes a new file"),
         (
             "export linear-delta --format klipper --into no.cfg -o x.cfg",
             "no.cfg: this printer.cfg does not exist",

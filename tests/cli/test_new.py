@@ -38,7 +38,7 @@ def test_measurement_template_lacks_only_rows(loopcal, tmp_path) -> None:
     assert "Optional columns: block, session, group, time" in template.read_text()
     loopcal(
         "calibrate printer.yaml heights.csv -o run",
-        "has a header but no rows; add one row for each pose",
+        "has a header but no rows. Add one row for each pose",
         code=1,
     )
     rows = [f"p{i},{150 + 7 * i},{150 + i * i},{160 - 3 * i},100.0" for i in range(12)]

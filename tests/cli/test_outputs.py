@@ -164,7 +164,7 @@ def test_import_with_a_failed_calibration_changes_no_file(loopcal) -> None:
 
 def test_template_of_a_kind_that_compares_poses_explains_their_names(loopcal) -> None:
     loopcal("new gough -o a.yaml --measurements m.csv --kind separation")
-    assert "name them in the column pose as a;b and leave its" in Path("m.csv").read_text()
+    assert "Name them in the column pose as a;b and leave its" in Path("m.csv").read_text()
     loopcal("new gough -o b.yaml --measurements n.csv --kind position")
     assert "compares two poses" not in Path("n.csv").read_text()
 
@@ -177,7 +177,7 @@ def test_removed_working_folder_is_named_as_the_cause(loopcal, tmp_path, monkeyp
     robot = find_robot_file("five-bar")
     for words in ("plan {} -o plan", "simulate {} -o data.csv", "check {}"):
         said = loopcal(words.format(robot), code=1).err
-        assert said == "loopcal: the working folder was removed; change to a folder that exists.\n"
+        assert said == "loopcal: the working folder was removed. Change to a folder that exists.\n"
 
 
 def test_folder_that_refuses_new_entries_is_not_called_missing(loopcal) -> None:

@@ -158,7 +158,7 @@ def test_data_file_with_a_surface_per_group_cannot_state_the_instrument(loopcal,
         words = "plan linear-delta -o plan --poses 12 --hold-out 0 --candidates 40 --force"
         loopcal(f"{words} --like groups.csv", code=code)
     (folder / "groups.csv").write_text(text.replace("1,a,", "1,b,"))
-    loopcal("plan linear-delta -o other --like groups.csv", "plan planes and lines", code=1)
+    loopcal("plan linear-delta -o other --like groups.csv", "Plan planes and lines", code=1)
 
 
 @pytest.mark.slow
@@ -216,7 +216,7 @@ def test_force_keeps_measured_values_and_files_of_the_user(loopcal, folder):
     empty = data.read_text()
     filled = empty.replace(",,,", ",1.5,2.5,3.5", 1)
     data.write_text(filled)
-    loopcal(again, "measurements.csv", "filled in or changed", code=1)
+    loopcal(again, "measurements.csv", "has changed since", code=1)
     assert data.read_text() == filled
     data.write_text(empty)
     (folder / "plan" / "notes.txt").write_text("leg 2 squeaks")
@@ -242,7 +242,7 @@ def test_second_plan_builds_on_the_measurements_of_the_first(loopcal, folder):
     fill = "simulate linear-delta --draw-errors --seed 2 --fill {}/measurements.csv -o {}.csv"
     loopcal(
         "calibrate linear-delta one/measurements.csv -o run",
-        "hold no measured value; fill in",
+        "contain no measured value. Fill in",
         code=1,
     )
     loopcal(fill.format("one", "one"))
@@ -292,9 +292,9 @@ def test_column_use_is_checked_and_excludes_hold_out(loopcal, folder):
     )
     text = (folder / "filled.csv").read_text()
     (folder / "wrong.csv").write_text(text.replace(",held-out,", ",perhaps,", 1))
-    loopcal("calibrate linear-delta wrong.csv -o run", "'perhaps'; write fit or held-out", code=1)
+    loopcal("calibrate linear-delta wrong.csv -o run", "'perhaps'. Write fit or held-out", code=1)
     (folder / "all.csv").write_text(text.replace(",fit,", ",held-out,"))
-    loopcal("calibrate linear-delta all.csv -o run", "leave some to fit", code=1)
+    loopcal("calibrate linear-delta all.csv -o run", "Leave some to fit", code=1)
 
 
 def test_plan_takes_the_instrument_from_a_file_without_rows(loopcal, folder) -> None:

@@ -72,7 +72,7 @@ def test_a_run_of_python_is_repeated_with_the_constant_of_its_loss(loopcal, fold
     assert result["options"]["fit"]["loss"] == {"name": "huber", "k": 2.0}
     result["options"]["fit"]["loss"] = {"name": "huber", "k": 0.5}
     (folder / "wide" / "result.json").write_text(json.dumps(result))
-    loopcal(["bootstrap", str(folder / "wide"), "--count", "10"], "cannot be repeated", code=1)
+    loopcal(["bootstrap", str(folder / "wide"), "--count", "10"], "gives another estimate", code=1)
 
 
 def test_sample_prints_the_size_of_the_sample_and_weights_its_draws(loopcal, folder) -> None:
@@ -80,7 +80,7 @@ def test_sample_prints_the_size_of_the_sample_and_weights_its_draws(loopcal, fol
     loopcal(
         f"sample {run} --count 600 -o {draws}",
         "600 weighted draws worth 5",
-        "No linear interval differs by more than 10 %",
+        "All linear intervals agree with the exact posterior within 10 %",
     )
     header, numbers = read_draws(draws)
     assert header[0] == "weight"
@@ -155,4 +155,4 @@ def test_a_run_with_another_estimate_than_its_data_have_is_not_examined(
         row["estimate"] = value / find_unit(row["unit"]).factor_to_si
     robot_text = (folder / "run" / "robot.yaml").read_text()
     write_run_folder(tmp_path / "run", result, arrays, robot_text)
-    loopcal(["bootstrap", str(tmp_path / "run"), "--count", "10"], "cannot be repeated", code=1)
+    loopcal(["bootstrap", str(tmp_path / "run"), "--count", "10"], "gives another estimate", code=1)

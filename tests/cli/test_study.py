@@ -169,7 +169,7 @@ def test_ctrl_c_leaves_a_folder_that_is_continued(tmp_path) -> None:
         out, err = driver.communicate(timeout=30.0)
     assert (driver.returncode, out) == (1, "")
     stored = len(read_contents(tmp_path / "f"))
-    assert f"loopcal: Stopped. {stored} of 3200 blocks are stored in f" in err
+    assert f"loopcal: Stopped. f contains {stored} of 3200 blocks" in err
     assert "use --resume to continue" in err
     assert "Traceback" not in err
 
@@ -203,7 +203,7 @@ def test_study_on_a_full_disk_is_continued_when_there_is_space(tmp_path) -> None
         words, cwd=tmp_path, capture_output=True, text=True, check=False, env=environment
     )
     assert done.stdout.splitlines()[0] == "1", done.stdout + done.stderr
-    assert "the disk takes no more" in done.stderr
+    assert "the disk is full" in done.stderr
     assert "Hint: use --resume to continue" in done.stderr
     assert done.stdout.splitlines()[-1] == "0"
     assert "24 of 24 blocks" in done.stdout
@@ -255,8 +255,8 @@ def test_failed_trials_lead_to_the_reason_in_check_summary_and_replay(loopcal, t
         tmp_path, 4, 2, f"poses: [5]\n{PER_LEG}".replace("{robot}", "hexapod-42")
     ).name
     out = loopcal(f"check {file}", "1 cell, 4 trials").out
-    advice = "Replay one of these trials to see the reason."
-    assert "Failed trials: 2 of 2. The trial was refused" in " ".join(out.split())
+    advice = "Replay one of these trials to find the reason."
+    assert "Failed trials: 2 of 2. loopcal refused the trial" in " ".join(out.split())
     assert advice in " ".join(out.split())
     loopcal(f"run {file} -o f {ONE}")
     loopcal("summary f", advice)
@@ -280,9 +280,7 @@ def test_joined_folders_of_two_studies_are_both_named(loopcal, tmp_path) -> None
         (tmp_path / "s.yaml").write_text(text.replace("seed: 3", seed))
         loopcal(f"run s.yaml -o {name} {ONE} --cells 1/4")
     loopcal(
-        "merge small large -o both",
-        "small: the study of this folder differs from that of large",
-        code=1,
+        "merge small large -o both", "small: the study of this folder differs from large", code=1
     )
 
 

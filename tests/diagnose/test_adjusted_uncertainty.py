@@ -266,5 +266,5 @@ def test_a_fit_with_a_loss_says_which_tests_are_not_made():
     texts = {f.code: str(f) for f in adjusted.findings}
     assert "noise.loss-contradicted" in texts
     assert not PATTERNS & set(texts)
-    assert "time, order" in texts["noise.weighted"]
+    assert "omits the chi-square test" in texts["noise.weighted"]
     assert "noise is not tested" not in texts["noise.weighted"]

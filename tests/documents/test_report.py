@@ -190,10 +190,10 @@ def test_failed_fit_has_no_values_for_a_machine(run) -> None:
     )
     text = render_html(build_calibration_document(failed))
     assert "setp genhexkins" not in text
-    assert "the report states no values for a controller" in text
+    assert "the report has no values for a controller" in text
     assert "A quality gate is not met. Do not write these values to a machine." in text
-    assert "Where the iteration ended (no estimates)" in text
-    assert "no calibrated geometry to draw" in text
+    assert "Values at the end of the iteration (no estimates)" in text
+    assert "the calibrated geometry is missing" in text
     assert "that of the calibrated geometry at the same readings" not in text
 
 
@@ -241,7 +241,7 @@ def test_report_of_a_cable_robot_names_its_repeatability_and_judges_no_sigma_by_
     assert main(["calibrate", "cable-4", "data.csv", "-o", "run", *limit]) == 2
     record = load_record(lc.load_run("run"))
     text = render_html(build(record, "verdict", "residuals"))
-    assert "no calibration reduces it" in text
+    assert "Calibration cannot reduce it" in text
     assert "better instrument" not in text
     assert "every pose is estimated too" in text
 

@@ -48,7 +48,7 @@ def test_changed_run_is_refused(root, tmp_path, monkeypatch, capsys, run) -> Non
     Path("run/result.json").write_text(text.replace('"findings": [', '"findings": [7,', 1))
     assert main(["report", "run"]) == 1
     said = capsys.readouterr().err
-    assert "result.json in this run folder is not what the calibration wrote; restore" in said
+    assert "result.json in this run folder has changed since the calibration. Restore" in said
     assert sorted(p.name for p in tmp_path.iterdir()) == ["run"]
 
 

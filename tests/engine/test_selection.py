@@ -106,7 +106,7 @@ def test_engines_that_cannot_compute_are_refused_in_a_sentence(installed, choice
 def test_a_wrong_name_ends_a_command_with_a_sentence(environment, capsys):
     environment("nativ")
     assert main(["check", "five-bar"]) == 1
-    assert "There is no engine 'nativ' here" in capsys.readouterr().err
+    assert "The engine 'nativ' is not installed" in capsys.readouterr().err
 
 
 def test_version_states_the_engine(environment, capsys):

@@ -232,7 +232,7 @@ def test_undetectable_deviations_are_reported_where_the_prior_hides_them():
     _, trials = simulate_deltas(1, {})
     coarse = get_finding(identify(DELTA, trials.trial(0)).findings, "prior.undetectable")
     assert set(coarse.data["together"]) == set(ARMS)
-    assert "hardly test the stated tolerances" in str(coarse)
+    assert "test the expected spreads" in str(coarse)
     poses = sample_workspace(DELTA, 20, 9).coordinates
     sharp = Instrument((Sensor(Component(("x", "y", "z")), Gaussian(np.full(3, 2e-6))),))
     fine = simulate_trials(DELTA, sample_truth(DELTA, 1, 9), poses, sharp, 9).trial(0)
@@ -256,12 +256,12 @@ def test_deviation_that_counts_as_detectable_is_detected_in_four_of_five_machine
 
 @pytest.mark.parametrize(
     ("method", "source"),
-    [(None, "the tolerances"), (MAP(), "the tolerances"), (LeastSquares(), "")],
+    [(None, "the expected spreads"), (MAP(), "the expected spreads"), (LeastSquares(), "")],
 )
 def test_tables_of_intervals_state_what_they_average_over(method, source):
     _, trials = simulate_deltas(1, {})
     fit = identify(DELTA, trials.trial(0), method)
-    note = f"Intervals use {source} as a prior"
+    note = f"The intervals rely on {source}. If"
     shown = "\n".join(str(block) for block in view_fit(fit))
     for text in (str(fit), shown, str(fit.to_dict()["interval_note"])):
         assert (note in " ".join(text.split())) == bool(source)

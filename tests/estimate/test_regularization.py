@@ -141,7 +141,7 @@ def _pose() -> lc.Instrument:
         ("--method ridge", "chosen by generalized cross-validation, score", "GCV"),
         (
             "--method ridge --lam 2",
-            "Ridge regression: lam = 2 (sigma per tolerance, squared)",
+            "Ridge regression: lam = 2 (sigma per expected spread, squared)",
             "fixed",
         ),
         ("--method tsvd", "chosen by generalized cross-validation, score", "TruncationGCV"),

@@ -93,7 +93,7 @@ def test_parts_are_equal_and_equally_many_for_each_thread(trials, threads, sizes
 
 @pytest.mark.parametrize("threads", [0, -1])
 def test_no_thread_is_refused(threads):
-    with pytest.raises(EstimationError, match=f"threads is {threads}; give 1 or more"):
+    with pytest.raises(EstimationError, match=f"threads is {threads}. Give 1 or more"):
         identify_trials(DELTA, simulate(1, poses=10), threads=threads)
     with pytest.raises(DataError, match="threads"):
         identify_trials(DELTA, simulate(1, poses=10), threads=1.5)  # pyright: ignore

@@ -68,5 +68,5 @@ def test_quantities_of_thousands_have_no_power_of_ten(value, text) -> None:
 )
 def test_a_factor_near_one_is_not_called_1_times(factor: float, words: str) -> None:
     sentence = str(report_finding("prior.inflation", factor=factor, parts=()))
-    assert f"tolerances {words}" in sentence
+    assert f"expected spreads {words}" in sentence
     assert " 1 times" not in sentence

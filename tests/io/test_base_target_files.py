@@ -98,13 +98,13 @@ MISTAKES = {
         ),
         "base.csv:3: the places of N1, N2, N3 on the base are neither stated nor unknown",
     ),
-    "a frame of its own": (
+    "a separate frame": (
         ("unknown: [frame]", "unknown: [frame]\n# frame: tracker"),
-        "base.csv:6: The frame 'tracker' of targets on the base",
+        "base.csv:6: Only rows of targets on the base measure the frame 'tracker'",
     ),
     "a frame that is not unknown": (
         ("# unknown: [frame]\n", ""),
-        "base.csv:2: The frame of the instrument is not unknown for N1, N2 and N3",
+        "base.csv:2: The frame of the instrument is known for N1, N2 and N3",
     ),
 }
 

@@ -173,7 +173,7 @@ def test_a_changed_run_has_no_certificate(tmp_path, run) -> None:
     for findings in ([7], ["a text"], []):
         assert content["findings"] != findings
         path.write_text(json.dumps({**content, "findings": findings}), "utf-8")
-        with pytest.raises(FileError, match="not what the calibration wrote"):
+        with pytest.raises(FileError, match="has changed since the calibration"):
             format_certificate(lc.load_run(path.parent), load_administration(write_facts(tmp_path)))
 
 
@@ -288,11 +288,11 @@ def test_characters_that_xml_cannot_hold_become_visible(tmp_path, run) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (("country: DE   ", "country: Germany"), r"'country' is 'Germany'; write two capital"),
-        (("value: 20.4 degC", "value: 20.4 C"), r"value' is '20.4 C'; write a number and its unit"),
+        (("country: DE   ", "country: Germany"), r"'country' is 'Germany'. Write two capital"),
+        (("value: 20.4 degC", "value: 20.4 C"), r"value' is '20.4 C'. Write a number and its unit"),
         (("begin: 2026-01-31", "begin: 2026-02-31"), "date|day is out of range|valid YAML"),
         (("end: 2026-01-31", "end: 2025-01-31"), r"'end' is 2025-01-31, before begin"),
-        (("place: laboratory ", "place: cellar "), "'place' is 'cellar'.*allowed"),
+        (("place: laboratory ", "place: cellar "), "'place' is 'cellar'.*Allowed"),
         (('serial_number: "0017"', 'serial_number: ""'), r"facts.yaml:10: .*serial_number' is"),
         (("machine:", "robot:"), "unknown key 'robot'"),
     ],
@@ -304,7 +304,7 @@ def test_wrong_facts_are_refused_at_their_line(tmp_path, change, message) -> Non
 
 def test_template_must_be_filled_in(tmp_path) -> None:
     (tmp_path / "facts.yaml").write_text(TEMPLATE, "utf-8")
-    with pytest.raises(FileError, match=r"facts.yaml:3: 'number' is empty; fill it in"):
+    with pytest.raises(FileError, match=r"facts.yaml:3: 'number' is empty. Fill it in"):
         load_administration(tmp_path / "facts.yaml")
     rows = load_administration(tmp_path / "facts.yaml", is_complete=False).list_rows()
     assert not any(rows.values())  # a report leaves lines to fill in by hand
@@ -314,7 +314,7 @@ def test_robot_files_have_no_certificate(tmp_path, robot) -> None:  # noqa: F811
     lc.save_robot(robot, tmp_path / "robot.yaml")
     facts = load_administration(write_facts(tmp_path))
     run = load_run_or_robot(tmp_path / "robot.yaml")
-    with pytest.raises(DataError, match="states no result; give a run folder"):
+    with pytest.raises(DataError, match=r"has no result. Give a run folder"):
         format_certificate(run, facts)
 
 

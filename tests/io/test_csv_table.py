@@ -68,9 +68,9 @@ def test_settings_are_read_from_a_sidecar_file(tmp_path) -> None:
         (GOOD, "", None, "is empty"),
         (GOOD, "# kind: pose\n", None, "no header"),
         ("p1,233.5,1e-3\n# skipped\n\np2,234.5,\n", "", 4, "a header but no rows"),
-        ("# kind: pose", "# cold day", 2, "begin a remark with ##"),
+        ("# kind: pose", "# cold day", 2, "Begin a remark with ##"),
         ("# kind: pose", "# kind: pose\n# kind: pose", 2, "duplicate key"),
-        ("q.leg1 [mm]", "q.leg1", 4, "column 'q.leg1' has no unit; write it in brackets"),
+        ("q.leg1 [mm]", "q.leg1", 4, "column 'q.leg1' has no unit. Write it in brackets"),
         ("q.leg1 [mm]", "q.leg1 []", 4, "column 'q.leg1': unknown unit ''"),
         (
             "q.leg1 [mm]",
@@ -88,14 +88,14 @@ def test_settings_are_read_from_a_sidecar_file(tmp_path) -> None:
         ("p1,233.5,1e-3", "p1,,1e-3", 5, "column 'q.leg1' is empty"),
         ("p1,233.5,1e-3", "p1,233.5mm,1e-3", 5, "is '233.5mm', but a number"),
         ("p1,233.5,1e-3", "p1,2_3,1e-3", 5, "is '2_3', but a number"),
-        ("p2,234.5,", "p2,234.5,NaN", 8, "is 'NaN', which is not finite; leave"),
+        ("p2,234.5,", "p2,234.5,NaN", 8, "is 'NaN', which is not finite. Leave"),
         ("p2,234.5,", "p2,234.5,inf", 8, "not finite"),
         ("p2,234.5,", 'p2,"234.5,', 8, "not valid CSV"),
         (
             "pose,q.leg1 [mm],rx [mrad]",
             "pose;q.leg1 [mm];rx [mrad]",
             4,
-            "separated by semicolons; use commas",
+            "separated by semicolons. Use commas",
         ),
     ],
 )
@@ -115,8 +115,8 @@ SIDECARS = {
     "- a\n- list\n": None,
     "not: [yaml\n": None,
     "": None,
-    "kind: component\n": r"at the top of this file and in data.yaml; remove one",
-    "noise: {x: 1 mm}\n": r"at the top of this file and in data.yaml; remove one",
+    "kind: component\n": r"at the top of this file and in data.yaml. Remove one",
+    "noise: {x: 1 mm}\n": r"at the top of this file and in data.yaml. Remove one",
 }
 
 

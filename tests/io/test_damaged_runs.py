@@ -172,7 +172,7 @@ def test_every_command_names_the_damaged_file(run, capsys, command) -> None:
     assert err.endswith("repeat the calibration\n")
     write_result(run, {"format": 2})
     assert main(command.split()) == 1
-    assert "RUN/result.json: this file of a run is damaged: it states no 'verdict'" in (
+    assert "RUN/result.json: this file of a run is damaged: it has no 'verdict'" in (
         capsys.readouterr().err
     )
     assert sorted(path.name for path in run.parent.rglob("*")) == before
@@ -298,7 +298,7 @@ MISTYPED = {
     '{"format": 1e999}': "the number 1e999 is not finite",
     '{"format": 1, "format": 1}': "the key 'format' is there twice",
     "[" * 100_000: "levels of nesting",
-    '{"format": "2"}': "'format' is '2'; allowed: 1, 2",
+    '{"format": "2"}': "'format' is '2'. Allowed: 1, 2",
     '{"format": 99}': "this run has format 99, but this loopcal reads formats up to 2",
     "9" * 5000: "not valid JSON (",
 }

@@ -55,9 +55,9 @@ def test_disk_that_becomes_full_keeps_the_old_folder_and_file(tmp_path, size) ->
         return ""
 
     refused = run_in_copy(limit_file_size(size, lambda: write(run, 2, force=True, size=1000)))
-    assert refused == (0, f"{run}: cannot write here (file too large); choose another place")
+    assert refused == (0, f"{run}: cannot write here (file too large). Choose another place")
     refused = run_in_copy(limit_file_size(size, write_file))
-    assert refused == (0, f"{file}: cannot write here (file too large); choose another place")
+    assert refused == (0, f"{file}: cannot write here (file too large). Choose another place")
     assert (read_value(run), file.read_text()) == (1, "old")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["data.csv", "run"]
 
@@ -87,7 +87,7 @@ def test_full_disk_keeps_the_old_folder(tmp_path) -> None:
     done = subprocess.run(
         words, cwd=tmp_path, capture_output=True, text=True, check=True, env=environment
     )
-    refused = "'disk/run: cannot write here (no space left on device); choose another place'"
+    refused = "'disk/run: cannot write here (no space left on device). Choose another place'"
     assert done.stdout.split("\n")[:6] == ["''", *[refused] * 2, "''", "['run']", "value: 2"]
 
 
@@ -102,7 +102,7 @@ def test_read_only_folder_is_refused_before_work_begins() -> None:
                 os.setuid(NOBODY)
                 return write(path, 1)
 
-            said = f"{path}: cannot write here (permission denied); choose another folder"
+            said = f"{path}: cannot write here (permission denied). Choose another folder"
             assert run_in_copy(refuse) == (0, said)
         assert list(place.iterdir()) == []
     finally:

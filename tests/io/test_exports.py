@@ -172,11 +172,11 @@ def test_one_line_holds_the_columns_of_all_targets(tmp_path) -> None:
 
 
 BAD_EXPORTS = {
-    "an empty file": (" \n", "export.txt: this export is empty; export it again"),
+    "an empty file": (" \n", "export.txt: this export is empty. Export it again"),
     "a preamble alone": ("Liste\n", ("export.txt:1: no line names the columns Name, X, Y, Z of "
                                     ".*profile.yaml")),
     "another header": ("A;B;C\n1;2;3\n", ("export.txt:1: no line names the columns Name, X, Y, "
-                                         "Z of .*profile.yaml; correct the profile$")),
+                                         "Z of .*profile.yaml. Correct the profile$")),
     "other separators": (EXPORT.replace(";", "\t"), "no line names the columns"),
     "decimal points instead of commas": (
         "Name;X;Y;Z\nP1;1.5;2.5;3\n",
@@ -201,11 +201,11 @@ def test_export_that_does_not_fit_the_profile_is_refused_with_the_reason(tmp_pat
 
 BAD_PROFILES = {
     "no delimiter": ("delimiter: semicolon\n", "", None, "no key 'delimiter'"),
-    "an unknown delimiter": ("semicolon", "pipe", 2, "'delimiter' is 'pipe'; allowed: 'comma'"),
+    "an unknown delimiter": ("semicolon", "pipe", 2, "'delimiter' is 'pipe'. Allowed: 'comma'"),
     "a comma for two things": ("semicolon", "comma", 3, "both the decimal mark and the separator"),
     "an unknown key": ("decimal", "decimals", 3, "unknown key 'decimals'.*did you mean 'decimal'"),
     "an unknown column": ("  z:", "  zz:", 8, "'zz' is not a column of .* the kind 'position'"),
-    "a missing column": ("  z: {from: Z, unit: mm}\n", "", 4, "states 0 sources of 'z'"),
+    "a missing column": ("  z: {from: Z, unit: mm}\n", "", 4, "gives 0 sources of 'z'"),
     "no unit": ("Z, unit: mm", "Z", 8, "'z' has no unit"),
     "an unknown unit": (
         "Z, unit: mm",
@@ -221,7 +221,7 @@ BAD_PROFILES = {
     "no pattern": ("position,", "position, targets: [a, b],", 5, "to 'match' of 'pose'"),
     "an unknown kind": ("position", "positon", 9, "is not a kind .* .did you mean 'position'"),
     "a matrix of four": ("decimal", "matrix: [1, 2, 3, 4]\ndecimal", 3, "matrix has nine columns"),
-    "no kind": ("kind: position, ", "", 9, "no kind of measurement is stated"),
+    "no kind": ("kind: position, ", "", 9, "the kind of measurement is missing"),
     "a newer format": ("format: 1", "format: 7", 1, "this file has format 7"),
     "an angle for a length": (
         "X, unit: mm",
@@ -237,7 +237,7 @@ BAD_PROFILES = {
         "'sigma.w' is not a column .*did you mean 'sigma",
     ),
     "another unit in the header": ("from: X", 'from: "X [m]"', 6, "header is 'X .m.', but"),
-    "degrees in the header": ("from: X", 'from: "X (°)"', 6, "write the unit deg"),
+    "degrees in the header": ("from: X", 'from: "X (°)"', 6, "Write the unit deg"),
     "no readings": ("settings", "readings:\nsettings", 9, "'readings' is empty"),
     "an empty value": ("delimiter", "missing: [null]\ndelimiter", 2, "'missing entry 1' is empty"),
 } | {
@@ -245,20 +245,20 @@ BAD_PROFILES = {
     for name in ("utf-99", "hex", "rot13")
 }
 BAD_UNCERTAINTIES = {
-    "factor 0": ("factor: 0.5, floor", "factor: 0, floor", 9, "'factor' is 0; write a positive"),
-    "floor 0": ("floor: 0.002 mm", "floor: 0 mm", 9, "'floor' is 0 mm; write a positive quantity"),
+    "factor 0": ("factor: 0.5, floor", "factor: 0, floor", 9, "'factor' is 0. Write a positive"),
+    "floor 0": ("floor: 0.002 mm", "floor: 0 mm", 9, "'floor' is 0 mm. Write a positive quantity"),
     "floor in degrees": ("floor: 0.002 mm", "floor: 2 deg", 9, "deg"),
     "floor without unit": ("floor: 0.002 mm", "floor: 2", 9, "unit"),
     "factor of x": ('mm]", unit: mm', 'mm]", unit: mm, factor: 2', 6, "'factor' belongs to"),
     "floor of x": ('mm]", unit: mm', 'mm]", unit: mm, floor: 1 um', 6, "'floor' belongs to"),
 }
 BAD_READINGS = {
-    "no pose": ("pose: {from: Point}, ", "", 4, "add the column 'pose'"),
+    "no pose": ("pose: {from: Point}, ", "", 4, "Add the column 'pose'"),
     "a measured column": (
         "pose: {from: Point}",
         "pose: {from: Point}, x: {from: L1, unit: mm}",
         4,
-        r"'x' is not a column of a table of readings \(no kind is stated\)",
+        r"'x' is not a column of a table of readings \(without a kind\)",
     ),
     "noise": ("robot: hexapod-42", "noise: {x: 1 um}", 12, "unknown key 'noise'"),
 }

@@ -94,12 +94,12 @@ pose,kind,left [deg],right [deg],x [mm],y [mm],distance [mm]
             "{serial_number: 0750123}",
             r"data.csv:3: .*'instrument.serial_number' is the number 750123",
         ),
-        ("{due: 31.5.2026}", r"data.csv:3: due is '31.5.2026'; write a date as 2026-05-31"),
-        ("{due: '2026-13-01'}", "write a date as 2026-05-31"),
+        ("{due: 31.5.2026}", r"data.csv:3: due is '31.5.2026'. Write a date as 2026-05-31"),
+        ("{due: '2026-13-01'}", "Write a date as 2026-05-31"),
         ("{calibrated: 2026-02-01, due: 2026-01-01}", "which is before calibrated"),
-        ("[AT960]", "write its name, or"),
-        ("{}", "write its name, or"),
-        ("12", "write its name, or"),
+        ("[AT960]", "Write its name, or"),
+        ("{}", "Write its name, or"),
+        ("12", "Write its name, or"),
     ],
 )
 def test_wrong_facts_are_refused_at_their_line(tmp_path, robot, data, setting, message) -> None:

@@ -145,12 +145,12 @@ REFUSED = {
                                                                                   r"'e'")),
     "no names": ({"poses": POSES, "heights": HEIGHTS.replace("pose,z", "note,z")}, ("this file "
                                                                                    "names none")),
-    "no kind at all": ({"poses": POSES, "more": POSES.replace("a,0", "f,0")}, ("no file states a "
+    "no kind at all": ({"poses": POSES, "more": POSES.replace("a,0", "f,0")}, ("no file has a "
                                                                               "kind")),
     "no kind for measured columns": (
         {"poses": POSES, "heights": HEIGHTS.replace("# kind: component\n# components: [z]\n# "
                                                     "noise: {z: 1 um}\n", "")},
-        (r"heights.csv:1: column 'z' is unknown.*states no kind"),
+        (r"heights.csv:1: column 'z' is unknown.*has no kind"),
     ),
     "settings of a kind in a table of poses": (
         {"poses": "# noise: {z: 1 um}\n" + POSES, "heights": HEIGHTS},
@@ -166,7 +166,7 @@ REFUSED = {
     ),
     "an empty cell of the readings": (
         {"poses": POSES.replace("b,1,", "b,,"), "heights": HEIGHTS},
-        ("poses.csv:3: column 'q1' is empty; write its value, or state 'reading_noise'"),
+        ("poses.csv:3: column 'q1' is empty. Write its value, or state 'reading_noise'"),
     ),
     "another block": (IN_BLOCKS, (r"tilts.csv:4: pose 'b' is in block '2' here and '1' in "
                                   r".*poses.csv:3")),

@@ -118,7 +118,7 @@ def test_copies_and_limbs_are_limited_before_they_are_made(tmp_path) -> None:
         load_robot(write(tmp_path, text.replace("0300", "300")))
 
     for count in (1_000_000_000, 101, 0, -1):
-        with pytest.raises(MechanismError, match=rf"limb 'west' has {count} copies; give 1 to 100"):
+        with pytest.raises(MechanismError, match=rf"limb 'west' has {count} copies. Give 1 to 100"):
             load(count)
     with pytest.raises(MechanismError, match="five-bar has 110 limbs, but at most 100"):
         load(50, 60)
@@ -245,7 +245,7 @@ def test_counts_on_the_command_line_are_refused_above_their_limit(name, capsys) 
     for words in COUNTED[name]:
         for number in (limit.most + 1, 10**9 + 1, 10**400):
             assert main([*words.split(), str(number)]) == 1
-            assert f"the limit is {limit}; give a smaller number" in capsys.readouterr().err
+            assert f"the limit is {limit}. Give a smaller number" in capsys.readouterr().err
 
 
 def test_every_option_that_takes_a_count_has_a_limit() -> None:

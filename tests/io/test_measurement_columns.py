@@ -216,10 +216,10 @@ REFUSED = {
         ("{q1: 5 um, q2: 0 mm}", "5 deg", 4, "'reading_noise': 'deg' is a unit of angle"),
         (",7,", ",-7,", 6, "column 'sigma.q6' is negative"),
         ("sigma.q6 [um]", "sigma.q6", 5, "column 'sigma.q6' has no unit"),
-        (",7,", ",,", 6, "column 'sigma.q6' is empty, and no other noise"),
+        (",7,", ",,", 6, "column 'sigma.q6' is empty, and this reading has no other noise"),
     ],
     CONTEXT: [
-        ("[degC]", "[mm]", 4, "'temperature' has the unit 'mm'; write one of .degC., .K., .degF."),
+        ("[degC]", "[mm]", 4, "'temperature' has the unit 'mm'. Write one of .degC., .K., .degF."),
         (" [degC]", "", 4, "column 'temperature' has no unit"),
         ("2026-05-04T10:22:31.5", "4.5.2026 10:22", 5, "'time' is '4.5.2026 10:22', but a date"),
         ("temperature.frame", "temperature.", 4, "column 'temperature.' is unknown"),

@@ -178,7 +178,12 @@ def test_commanded_coordinates_are_converted_by_the_controller(tmp_path, robot) 
 @pytest.mark.parametrize(
     ("old", "new", "line", "message"),
     [
-        ("# kind: component\n", "", None, "no kind of measurement is stated; write '# kind: pose'"),
+        (
+            "# kind: component\n",
+            "",
+            None,
+            "the kind of measurement is missing; write '# kind: pose'",
+        ),
         (
             "component\n",
             "komponent\n",
@@ -188,11 +193,11 @@ def test_commanded_coordinates_are_converted_by_the_controller(tmp_path, robot) 
         ("[z]", "[q]", 2, "component 'q' does not exist"),
         ("[z]", "[3]", 2, "'components entry 1' is the number 3"),
         ("# components", "# componets", 2, "unknown key 'componets' .did you mean 'components'"),
-        ("1 um", "1", 3, "'noise.z': '1' has no unit; add one of m, mm, um"),
+        ("1 um", "1", 3, "'noise.z': '1' has no unit. Add one of m, mm, um"),
         ("1 um", "1 urad", 3, "'noise.z': 'urad' is a unit of angle"),
         ("1 um", "-1 um", 3, "the noise of 'z' is -1 um"),
         ("z: 1 um", "zz: 1 um", 3, "unknown key 'zz' in 'noise'"),
-        ("# noise: {z: 1 um}\n", "", None, "no noise is stated for 'z'"),
+        ("# noise: {z: 1 um}\n", "", None, "'z' has no noise"),
         ("# kind", "# format: 9\n# kind", 1, "has format 9"),
         ("z [mm]", "z", 4, "column 'z' has no unit"),
         ("z [mm]", "zz [mm]", 4, "column 'zz' is unknown .did you mean 'z'"),

@@ -226,7 +226,7 @@ def test_joint_with_reading_and_measurement_has_two_columns(tmp_path) -> None:
     ]
     with pytest.raises(
         FileError,
-        match=r"'q1' is a reading and a measured column; name the measured one 'measured.q1'",
+        match=r"'q1' is a reading and a measured column. Name the measured one 'measured.q1'",
     ):
         convert(tmp_path, "Name,B1,J1\n1,5,7\n", JOINT.replace("  measured.q1", "  q1"))
 
@@ -248,7 +248,7 @@ def test_import_reports_targets_with_different_times(tmp_path, monkeypatch, caps
     convert(tmp_path, lines, TARGETS.replace("MORE", "time: {from: When}"))
     words = ["import", "export.txt", "--profile", "profile.yaml", "-o", "data.csv"]
     assert main(words) == 0
-    assert "note: 1 line of further targets state another time" in capsys.readouterr().out
+    assert "note: 1 line of further targets with another time" in capsys.readouterr().out
     assert main([*words, "--json", "--force"]) == 0
     assert len(json.loads(capsys.readouterr().out)["notes"]) == 1
 

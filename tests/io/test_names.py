@@ -187,5 +187,5 @@ def test_composed_names_may_be_longer() -> None:
     long, composed = "x" * 150, ".".join(["x" * 150] * 3)
     text = f"family: f\nname: {long}\nidentified:\n- {{name: {composed}}}\nfixed: [{composed}]\n"
     assert parse_yaml(text, "r.yaml", "robot file").content["name"] == long
-    with pytest.raises(FileError, match="has 452 characters, but at most 200 are allowed"):
+    with pytest.raises(FileError, match="has 452 characters, above the limit of 200"):
         parse_yaml(f"family: f\nname: {composed}", "r.yaml", "robot file")

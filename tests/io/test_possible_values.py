@@ -95,7 +95,7 @@ def test_values_of_tolerated_machines_are_accepted(name: str, tmp_path: Path) ->
 
 def test_values_whose_loops_do_not_close_are_refused_together(tmp_path: Path) -> None:
     rows = "  - {name: arm1.length, value: 900, unit: mm}\n  - {name: radius, value: 5, unit: m}"
-    with pytest.raises(FileError, match=r"cannot be closed at the readings of home.* radius = 5"):
+    with pytest.raises(FileError, match=r"do not close at the readings of home.* radius = 5"):
         load_robot(write_table(tmp_path, "linear-delta", rows))
 
 

@@ -65,7 +65,7 @@ G30 = ("{}", "Bed X:{x:.2f} Y:{y:.2f} Z:{h:.3f}\nok\nX:{x:.2f} Y:{y:.2f} Z:10.00
 M114 = ("{}", "X:{x:.2f} Y:{y:.2f} Z:{h:.3f} E:0.00 Count X:100 Y:200 Z:300\n")
 G32, BED = (
     ("G32 bed probe heights:{}, mean 0, deviation 0", " {h:.3f}"),
-    "G30 P{i} X{x:.3f} Y{y:.3f} Z-99999 ; point\n",
+    "G30 P{i} X{x:.3f} Y{y:.3f} Z-99999 . Point\n",
 )
 OLD = (
     "M561\nBed probe heights: 0.000 0.000\nBed probe heights:{}, mean 0, deviation 0",
@@ -201,38 +201,42 @@ def test_a_height_map_of_reprapfirmware() -> None:
 @pytest.mark.parametrize(
     ("config", "report", "words"),
     [
-        ("m503.gcode", "ok\nBed X:0 Y:0 Z:0.1\n", "1 probed height; six numbers"),
+        ("m503.gcode", "ok\nBed X:0 Y:0 Z:0.1\n", "1 probed height, but six numbers"),
         ("m503.gcode", "hello\n", "contains no probe report of Marlin"),
         ("config.g", "hello\n", "contains no probe report of RepRapFirmware"),
-        ("m503.gcode", "Checking... AC at radius:80.00\n.  c:+0.1\n", "is no dry run"),
-        ("m503.gcode", "Checking... AC (DRY-RUN)\n.  c:+0.1\n", "states no radius"),
-        ("config.g", "G32 bed probe heights: 0.1 not set 0.2, mean 1\n", "a point that was not"),
-        ("config.g", "G32 bed probe heights: 0.1 0.2, mean 1\n", "state no G30 P0"),
-        ("m503.gcode", "Bed X: 1,00 Y: 2,00 Z: 0,107\n", "report.txt:1: The numbers of"),
-        ("m503.gcode", "ok\nBed X: 1.00 Y: 2.00 Z: 0,107\n", "report.txt:2: The numbers of this"),
-        ("m503.gcode", "ok\nBed X: 1.00 Y: 2.\n", "cannot be read: 'Bed X: 1.00 Y: 2.'. Marlin"),
-        ("m503.gcode", "X:1,0 Y:2,0 Z:0,1 E:0,0 Count X:1\n", "with decimal points"),
-        ("config.g", "G32 bed probe heights: 0,1 0,2, mean 1\n", "cannot be read: '0,1 0,2'"),
-        ("config.g", "G1 X0 Y0\nG30 S-1\nStopped at height 2.1 mm\n", "state none (G31 Z..)"),
+        ("m503.gcode", "Checking... AC at radius:80.00\n.  c:+0.1\n", "is not a dry run"),
+        ("m503.gcode", "Checking... AC (DRY-RUN)\n.  c:+0.1\n", "lacks the radius"),
+        ("config.g", "G32 bed probe heights: 0.1 not set 0.2, mean 1\n", "failed to probe a point"),
+        ("config.g", "G32 bed probe heights: 0.1 0.2, mean 1\n", "contain no G30 P0"),
+        ("m503.gcode", "Bed X: 1,00 Y: 2,00 Z: 0,107\n", "report.txt:1: loopcal cannot read"),
+        ("m503.gcode", "ok\nBed X: 1.00 Y: 2.00 Z: 0,107\n", "report.txt:2: loopcal cannot"),
         (
-            "config.g",
-            "G31 Z2\nG30 S-1\nStopped at height 2 mm\nG1 X0 Y0\n",
-            "its point is not known",
+            "m503.gcode",
+            "ok\nBed X: 1.00 Y: 2.\n",
+            "read this probed point: 'Bed X: 1.00 Y: 2.'. Marlin",
         ),
+        ("m503.gcode", "X:1,0 Y:2,0 Z:0,1 E:0,0 Count X:1\n", "with decimal points"),
+        ("config.g", "G32 bed probe heights: 0,1 0,2, mean 1\n", "of this G32: '0,1 0,2'"),
+        ("config.g", "G1 X0 Y0\nG30 S-1\nStopped at height 2.1 mm\n", "the files lack (G31 Z..)"),
+        ("config.g", "G31 Z2\nG30 S-1\nStopped at height 2 mm\nG1 X0 Y0\n", "its point is unknown"),
         (
             "config.g",
             "G31 Z2\n" + 2 * "G1 X0 Y0\nG30 S-1\n" + "Stopped at height 2 mm\n",
-            "has 1 height, but the files state 2 points",
+            "has 1 height, but the files have 2 points",
         ),
-        ("config.g", "Calibrated 6 factors using 13 points, deviation\n", "End bed.g with S-1"),
+        (
+            "config.g",
+            "Calibrated 6 factors using 13 points, deviation\n",
+            "Replace S6 at the end of bed.g",
+        ),
         ("config.g", "Bed probe heights: 0.000 0.000 0.000 0.000 0.000\n", "no probe report"),
-        ("m503.gcode", 9 * "Bed X:1 Y:2 Z:0\nBed X:1 Y:2 Z:319\n", "are they in micrometers?"),
+        ("m503.gcode", 9 * "Bed X:1 Y:2 Z:0\nBed X:1 Y:2 Z:319\n", "Are they in micrometers?"),
         (
             "config.g",
             "G30 P0 X0 Y0\nG30 P1 X9 Y0\nG30 P2 X0 Y9\nG32 bed probe heights: 0.1 0.2, mean 1\n",
-            "report.txt:4: The answer has 2 heights, but the files state 3 points",
+            "report.txt:4: The answer has 2 heights, but the files have 3 points",
         ),
-        ("config.g", "RepRapFirmware height map file v2\nx\n", "rows and columns that it states"),
+        ("config.g", "RepRapFirmware height map file v2\nx\n", "differ from its header"),
     ],
 )
 def test_reports_that_cannot_be_used_are_refused(config, report, words, capsys) -> None:
@@ -284,10 +288,10 @@ def test_one_wrong_height_is_an_outlier_and_no_target_that_stands_still(capsys) 
 @pytest.mark.parametrize(
     ("config", "shift", "words"),
     [
-        (REPRAP + "G31 P500 X0 Y0 Z-2.1\n", 4.2, "twice the stated Z-2.1: its sign"),
-        (REPRAP + "G31 P500 X0 Y0 Z2.1\n", 3.0, "shifted by 3 mm, and differ by 0"),
-        (REPRAP + "G31 P500 Z2.1\n", 0.5, "No file states X and Y of G31"),
-        (MARLIN + "M851 X0 Y0 Z1.4\n", 2.8, "twice the stated Z1.4: its sign"),
+        (REPRAP + "G31 P500 X0 Y0 Z-2.1\n", 4.2, "twice Z-2.1 of the file: its sign"),
+        (REPRAP + "G31 P500 X0 Y0 Z2.1\n", 3.0, "shift of 3 mm, and differ by 0"),
+        (REPRAP + "G31 P500 Z2.1\n", 0.5, "The files lack X and Y of G31"),
+        (MARLIN + "M851 X0 Y0 Z1.4\n", 2.8, "twice Z1.4 of the file: its sign"),
     ],
 )
 def test_what_heights_cannot_show_of_the_probe_is_said(config, shift, words, capsys) -> None:
@@ -309,7 +313,7 @@ def test_height_maps_of_two_days_are_named(capsys) -> None:
         head = f"RepRapFirmware height map file v2 generated at {day} 10:00, min error 0\n"
         Path(f"{name}.csv").write_text(head + titles + rows)
     assert run("import config.g --probes a.csv --probes b.csv -o p.yaml --data h.csv") == 0
-    assert "are of 2026-05-04 and 2026-05-31" in " ".join(capsys.readouterr().out.split())
+    assert "are from 2026-05-04 and 2026-05-31" in " ".join(capsys.readouterr().out.split())
 
 
 @pytest.mark.parametrize(
@@ -355,7 +359,7 @@ def test_values_that_turn_the_base_frame_are_named_and_others_keep_it(capsys) ->
     assert run("export run --format reprap -o new.g --force") in (0, 2)
     assert "These values turn all of a program by 1." in " ".join(capsys.readouterr().out.split())
     assert run("export run --format reprap -o kept.g --keep-frame --force") in (0, 2)
-    assert "no values of this robot keep" in " ".join(capsys.readouterr().out.split()).lower()
+    assert "all values of this robot move" in " ".join(capsys.readouterr().out.split()).lower()
     targets = 1e-3 * np.array([[x, y, 0.0] for x, y in POINTS])
     readings, turns, heights = inverse(robot, targets).q, [], []
     for name in ("new", "kept"):
@@ -396,4 +400,4 @@ def test_joined_files_of_two_days_are_named(capsys) -> None:
         lines = [start + r if r[0].isdigit() else r for r in new.splitlines()]
         Path(f"{name}.csv").write_text("\n".join(lines))
     assert run("calibrate p.yaml b.csv c.csv -o run --allow-duplicates --verbose") in (0, 2)
-    assert "measured on 2026-05-04 and 2026-05-31" in " ".join(capsys.readouterr().out.split())
+    assert "are from 2026-05-04 and 2026-05-31" in " ".join(capsys.readouterr().out.split())

@@ -74,7 +74,7 @@ def test_zero_without_a_floor_is_named_and_missing_sigma_stays_missing(tmp_path)
     plain = PROFILE.replace(", floor: 0.002 mm", "").replace(", factor: 0.5", "")
     found = convert(tmp_path, profile=plain)
     assert [line for line, _ in found.misfits] == [3, 4]
-    assert "'sigma.y' is 0, but must be positive; state a 'floor'" in found.misfits[0][1]
+    assert "'sigma.y' is 0, but must be positive. Give a 'floor'" in found.misfits[0][1]
     assert read_rows(found.text) == ["P3,,9.75,8,4.5,5,205"]
 
 

@@ -93,35 +93,35 @@ def test_numbers_are_converted_to_si_units_and_defaults_are_not() -> None:
         ("name: h\n", "", None, "no key 'name'"),
         ("- [1, 2, 3]", "- [1, 2]", 7, "'leg.base entry 1' has 2 values, but 3"),
         ("- [1, 2, 3]", "- [1]", 7, "'leg.base entry 1' has 1 values, but 3"),
-        ("- [1, 2, 3]", "- [1, 2, 3, 4]", 7, "has 4 values, but 3 are needed; remove"),
+        ("- [1, 2, 3]", "- [1, 2, 3, 4]", 7, "has 4 values, but 3 are needed. Remove"),
         ("- [1, 2, 3]", "- 5", 7, "is the number 5, but a list"),
         (
             "[1, 2, 3]",
             "[1, '2', 3]",
             7,
-            "is the text '2', but a number is needed; write the number without quotes",
+            "is the text '2', but a number is needed. Write the number without quotes",
         ),
         ("[1, 2, 3]", "[1, 2mm, 3]", 7, "is the text '2mm', but a number"),
         ("[1, 2, 3]", "[1, nan, 3]", 7, "is the text 'nan', but a number"),
-        ("[1, 2, 3]", "[1, .nan, 3]", 7, "is nan; write a finite number"),
-        ("[1, 2, 3]", "[1, -.inf, 3]", 7, "is -inf; write a finite number"),
-        ("[1, 2, 3]", "[1, 1e999, 3]", 7, "write a finite number"),
+        ("[1, 2, 3]", "[1, .nan, 3]", 7, "is nan. Write a finite number"),
+        ("[1, 2, 3]", "[1, -.inf, 3]", 7, "is -inf. Write a finite number"),
+        ("[1, 2, 3]", "[1, 1e999, 3]", 7, "Write a finite number"),
         ("[1, 2, 3]", "[1, true, 3]", 7, "is the value true, but a number"),
         ("[1, 2, 3]", "[1, , 3]", 7, "not valid YAML"),
         ("[1, 2, 3]", "!foo 5", 7, "YAML tags are not allowed"),
         ("[1, 2, 3]", "!!int ''", 7, "YAML tags are not allowed"),
         ("[1, 2, 3]", "!!omap x", 7, "YAML tags are not allowed"),
-        ("[1, 2, 3]", "=", 7, "put it in quotes"),
+        ("[1, 2, 3]", "=", 7, "Put it in quotes"),
         ("legs: rod", "legs: rood", 5, "'leg.legs' is 'rood' .did you mean 'rod'"),
-        ("legs: rod", "legs: ups", 6, "unknown key 'base' in 'leg'; allowed: joints, legs"),
+        ("legs: rod", "legs: ups", 6, "unknown key 'base' in 'leg'. Allowed: joints, legs"),
         ("  base:", "  bse:", 6, "unknown key 'bse' in 'leg' .did you mean 'base'"),
-        ("units: {length: mm, angle: deg}\n", "", None, "states no units"),
-        ("length: mm, ", "", 2, "'units' has no key 'length'; add it"),
+        ("units: {length: mm, angle: deg}\n", "", None, "has no units"),
+        ("length: mm, ", "", 2, "'units' has no key 'length'. Add it"),
         ("length: mm", "length: mmm", 2, "'units.length' is 'mmm' .did you mean 'mm'"),
-        ("length: mm", "length: deg", 2, "'units.length' is 'deg'; allowed: 'm', 'mm'"),
+        ("length: mm", "length: deg", 2, "'units.length' is 'deg'. Allowed: 'm', 'mm'"),
         ("name: h", "name: 3", 3, "is the number 3, but text"),
         ("name: h", "name: h\ncount: 3.5", 4, "is the number 3.5, but a whole number"),
-        ("name: h", "name: h\nmode: u", 4, "'mode' is 'u'.*; allowed: 'up', 'down'"),
+        ("name: h", "name: h\nmode: u", 4, "'mode' is 'u'.*. Allowed: 'up', 'down'"),
         ("name: h", "name: h\nname: g", 4, "duplicate key 'name'"),
         ("name: h", "name: h\n3: g", 4, "key 3 is not text"),
         ("name: h", "name: [h", 4, "not valid YAML"),
@@ -227,7 +227,7 @@ class Part:
 
     def __post_init__(self) -> None:
         if self.size < 0.0:
-            raise ValueError("size is negative; it must be above 0")
+            raise ValueError("size is negative, but must be above 0")
 
 
 @dataclass(frozen=True)
@@ -283,7 +283,7 @@ def test_records_of_a_union_are_told_apart_by_their_keys_and_constants() -> None
         assert read_record(file, FITS | {"first": node}, Whole, None).first == expected
     with pytest.raises(FileError, match=r"'first.kind' is 'bax' .did you mean 'box'"):
         read_record(file, FITS | {"first": {"size": 1, "kind": "bax"}}, Whole, None)
-    with pytest.raises(FileError, match=r"'others.a.size' is negative; it must be above 0"):
+    with pytest.raises(FileError, match=r"'others.a.size' is negative, but must be above 0"):
         read_record(file, FITS | {"others": {"a": {"size": -1}}}, Whole, None)
 
 

@@ -93,7 +93,7 @@ def test_changed_file_is_never_removed(tmp_path, name) -> None:
         assert "something other than a run" in found
         (tmp_path / "a" / name).write_bytes(content.replace(b'"text": ""', b'"text": "mine"'))
         found = refuse(tmp_path / "a")
-    assert f"{name} in this folder was filled in or changed" in found
+    assert f"{name} in this folder has changed" in found
 
 
 def test_folder_of_a_version_without_list_may_contain_known_names(tmp_path) -> None:
@@ -173,7 +173,7 @@ def test_folder_set_aside_is_named_by_readers_and_returned_by_writers(tmp_path) 
     path = tmp_path / "a"
     leftover = leave(path, OLD)
     before = read_all(leftover)
-    assert f"left it as {leftover}; rename" in describe_leftover(path, "result.json")
+    assert f"left it as {leftover}. Rename" in describe_leftover(path, "result.json")
     with pytest.raises(FileError, match="not empty"):
         refuse_folder(path, RUN, force=False)
     assert (read_all(path), [p.name for p in tmp_path.iterdir()]) == (before, ["a"])

@@ -81,7 +81,7 @@ def test_robot_without_a_file_cannot_be_saved(tmp_path, robot) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("format: 1\n", "", "states no format; begin it with 'format: 1'"),
+        ("format: 1\n", "", "has no format. Begin it with 'format: 1'"),
         ("format: 1", "format: 2", "format 2, but this loopcal reads formats up to 1"),
         ("format: 1", "format: one", "'format' is 'one'"),
         (
@@ -89,17 +89,17 @@ def test_robot_without_a_file_cannot_be_saved(tmp_path, robot) -> None:
             "family: guogh",
             "'guogh' is not a family of robots .*did you mean 'gough'",
         ),
-        ("family: gough\n", "", "names no family; write 'family:' and one of .*gough"),
-        ("units: {length: mm, angle: deg}\n", "", "states no units"),
+        ("family: gough\n", "", "names no family. Write 'family:' and one of .*gough"),
+        ("units: {length: mm, angle: deg}\n", "", "has no units"),
         ("stroke: [-75, 75]", "strokes: [-75, 75]", "unknown key 'strokes' .did you mean 'stroke'"),
         ("stroke: [-75, 75]", "stroke: [-75]", "'stroke' has 1 values, but 2"),
         ("[120, -140, 0]", "[120, -140]", "'base entry 1' has 2 values, but 3"),
         ("[120, -140, 0]", "[120, '-140', 0]", "is the text '-140', but a number is needed"),
-        ("[120, -140, 0]", "[120, .nan, 0]", "is nan; write a finite number"),
+        ("[120, -140, 0]", "[120, .nan, 0]", "is nan. Write a finite number"),
         ("home: {z: 200}", "home: {z: 200}\nhome: {z: 200}", "duplicate key 'home'"),
         ("home: {z: 200}", "home: {zz: 200}", "unknown key 'zz' in 'home'"),
         ("lengths: 233.238076 ", "lengths: long ", "'lengths' is the text 'long'"),
-        ("legs: rod", "legs: pole", "'legs' is 'pole'.*; allowed: 'rod'"),
+        ("legs: rod", "legs: pole", "'legs' is 'pole'.*. Allowed: 'rod'"),
     ],
 )
 def test_error_in_a_robot_file_is_reported_with_its_line(
@@ -125,7 +125,7 @@ def test_error_in_a_robot_file_is_reported_with_its_line(
         ("{name: leg1.base.x, value: a, unit: mm}", "the value of 'leg1.base.x' is 'a'"),
         ("{name: leg1.base.x, value: 1}", "has no 'unit'"),
         ("{name: leg1.base.x, vale: 1, unit: mm}", "unknown key 'vale' .*did you mean 'value'"),
-        ("5", "this row is not a mapping; write"),
+        ("5", "this row is not a mapping. Write"),
     ],
 )
 def test_error_in_the_identified_table_is_reported_with_its_line(

@@ -80,7 +80,7 @@ def test_what_is_no_complete_run_is_refused(tmp_path) -> None:
         with pytest.raises(FileError, match=word):
             read_run_folder(folder)
     (folder / "arrays.npz").unlink()
-    with pytest.raises(FileError, match=r"damaged: arrays\.npz missing; restore it, or repeat"):
+    with pytest.raises(FileError, match=r"damaged: arrays\.npz missing. Restore it, or repeat"):
         read_run_folder(folder)
     (folder / "robot.yaml").unlink()
     with pytest.raises(FileError, match=r"arrays\.npz and robot\.yaml missing"):

@@ -287,15 +287,15 @@ def test_a_prior_without_a_session_holds_in_every_session_in_python(tmp_path):
 @pytest.mark.parametrize(
     ("line", "words"),
     [
-        ("scale: 2 ppm", "write 'scale: {sd: 2 ppm}'"),
-        ("scale: {}", "write 'scale: {sd: 2 ppm}'"),
+        ("scale: 2 ppm", "Write 'scale: {sd: 2 ppm}'"),
+        ("scale: {}", "Write 'scale: {sd: 2 ppm}'"),
         ("scale: {mean: 2 ppm}", "an uncertainty is stated once"),
-        ("scale: {sd: 2}", "write a number and one of 1, ppm, um/m"),
-        ("scale: {sd: 2 mm}", "write a number and one of 1, ppm, um/m"),
-        ("scale: {sd: nan ppm}", "write a number and one of"),
+        ("scale: {sd: 2}", "Write a number and one of 1, ppm, um/m"),
+        ("scale: {sd: 2 mm}", "Write a number and one of 1, ppm, um/m"),
+        ("scale: {sd: nan ppm}", "Write a number and one of"),
         ("scale: {sd: -2 ppm}", "'sd' of 'scale' is -2 ppm; write a positive number"),
         ("scale: {sd: 2 ppm, sigma: 3 ppm}", "sigma"),
-        ("scale: {sd: 2 ppm, scope: robot}", "the scope is 'robot'; write session, or all"),
+        ("scale: {sd: 2 ppm, scope: robot}", "the scope is 'robot'. Write session, or all"),
         ("temperature: {value: 23 mm, sd: 1 K, expansion: 11.5 ppm/K}", "degC, K, degF"),
         ("temperature: {value: 23 degC, sd: 1 mm, expansion: 11.5 ppm/K}", "degC, K, degF"),
         ("temperature: {value: 23 degC, sd: 1 K, expansion: 11.5 ppm}", "ppm/K"),
@@ -303,7 +303,7 @@ def test_a_prior_without_a_session_holds_in_every_session_in_python(tmp_path):
         ("temperature: {value: -5 K, sd: 1 K, expansion: 11.5 ppm/K}", "below absolute zero"),
         ("mpe: {per_length: 6 um/m}", "has no key 'constant'"),
         ("mpe: {constant: -6 um}", "positive number"),
-        ("mpe: {constant: 6 ppm}", "write a number and one of m, mm"),
+        ("mpe: {constant: 6 ppm}", "Write a number and one of m, mm"),
     ],
 )
 def test_wrong_scales_are_refused_at_their_place(tmp_path, line, words):
@@ -316,7 +316,7 @@ def test_wrong_scales_are_refused_at_their_place(tmp_path, line, words):
 def test_contradictions_of_scales_are_refused(tmp_path):
     _, data = measure_biased()
     lines = ["mpe: {constant: 6 um, per_length: 2 ppm}", "scale: {sd: 2 ppm}"]
-    with pytest.raises(FileError, match="both state the scale of the instrument; remove one"):
+    with pytest.raises(FileError, match=r"both define the scale of the instrument. Remove one"):
         load_measurements(save_with(tmp_path / "a.csv", data, *lines), DELTA)
     lines = ["scale: {sd: 2 ppm, scope: all}", "unknowns: {mon.component.scale: {sd: 5 ppm}}"]
     with pytest.raises(FileError, match="has the scope all in another line or file"):
@@ -328,7 +328,7 @@ def test_angles_have_no_scale(tmp_path, key):
     text = f"# kind: inclination\n# noise: {{'*': 5 urad}}\n# {key}: {{sd: 2 ppm}}\n"
     path = tmp_path / "a.csv"
     path.write_text(text + "q1 [mm],q2 [mm],q3 [mm],tilt_x [mrad],tilt_y [mrad]\n200,200,200,1,2\n")
-    with pytest.raises(FileError, match=f"'inclination' measures no lengths; remove '{key}'"):
+    with pytest.raises(FileError, match=f"'inclination' measures no lengths. Remove '{key}'"):
         load_measurements(path, DELTA)
 
 

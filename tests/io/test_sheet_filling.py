@@ -204,7 +204,7 @@ def test_unknown_target_is_a_misfit_with_its_line(robot, sheet, points, tmp_path
 
 def test_inches_without_the_unit_are_refused(robot, sheet, points, tmp_path) -> None:
     export = write_spatial_analyzer(tmp_path / "e.txt", points, scale=1 / 25.4)
-    with pytest.raises(DataError, match=r"unit mm, but its points fit .* the unit in "):
+    with pytest.raises(DataError, match=r"unit mm, but the points fit .* the unit in "):
         examine(robot, sheet, export)
 
 
@@ -269,7 +269,7 @@ def test_moved_tracker_is_refused_and_two_files_are_two_sessions(
         (name, xyz + np.array([3.0, 2.0, -1.0]) * (i >= 21)) for i, (name, xyz) in enumerate(points)
     ]
     whole = write_spatial_analyzer(tmp_path / "all.txt", moved)
-    with pytest.raises(DataError, match="up to pose 7 and those from pose 8 fit two positions"):
+    with pytest.raises(DataError, match="up to pose 7 and from pose 8 fit two positions"):
         examine(robot, sheet, whole)
     days = [
         write_spatial_analyzer(tmp_path / f"{day}.txt", some)
@@ -289,7 +289,7 @@ def test_small_move_of_the_tracker_is_reported(robot, sheet, points, tmp_path) -
     ]
     (found,) = examine(robot, sheet, write_spatial_analyzer(tmp_path / "e.txt", moved))
     assert found.code == "sheet.instrument-perhaps-moved"
-    assert "up to pose 7 and those from pose 8" in str(found)
+    assert "up to pose 7 and from pose 8" in str(found)
     assert examine(robot, sheet, write_spatial_analyzer(tmp_path / "f.txt", points)) == ()
 
 
@@ -324,7 +324,7 @@ def test_one_target_needs_no_name_of_a_target(robot, simulated, points, tmp_path
 def test_filled_sheet_is_refused(robot, sheet, points, tmp_path) -> None:
     path = write_spatial_analyzer(tmp_path / "e.txt", points)
     save_converted(fill(robot, sheet, path).text, tmp_path / "measured.csv")
-    with pytest.raises(FileError, match="this sheet has measured values already"):
+    with pytest.raises(FileError, match="this sheet already has measured values"):
         fill(robot, tmp_path / "measured.csv", path)
 
 
@@ -336,8 +336,8 @@ def test_command_prints_what_is_filled_in_and_what_is_not(
     words = "fill hexapod-42 sheet.csv points.txt --profile spatial-analyzer -o measured.csv"
     assert main(words.split()) == 0
     said = " ".join(capsys.readouterr().out.split())
-    assert "measured.csv: 39 points at 13 of 14 poses filled in" in said
-    assert "the export lacks 3 of the 42 points of the sheet: 1_SMR1, 1_SMR2 and 1_SMR3" in said
+    assert "measured.csv: wrote 39 points at 13 of 14 poses" in said
+    assert "and their cells stay empty: 1_SMR1, 1_SMR2 and 1_SMR3" in said
     assert "points.txt:44 does not match: it names the pose 'floor', but no target" in said
     assert main([*words.split(), "--force", "--profile", "leicca"]) == 1
     assert "faro, leica, spatial-analyzer and wide" in capsys.readouterr().err

@@ -58,7 +58,7 @@ def test_copies_with_fewer_digits_are_refused_by_name(step: float, count: int) -
 def test_calibrate_refuses_copies_unless_they_are_allowed() -> None:
     data = append_copies(hexapod_data(30), np.arange(30), 1e-5 * MM)
     robot = lc.load_robot("hexapod-42")
-    with pytest.raises(lc.DataError, match="have the same pose values up to rounding, as 29 more"):
+    with pytest.raises(lc.DataError, match="have equal pose values up to rounding, as 29 more"):
         lc.calibrate(robot, data)
     allowed = lc.CalibrationOptions(allow_duplicates=True, check_conventions=False)
     assert lc.calibrate(robot, data, allowed).identification.converged

@@ -37,7 +37,7 @@ def test_sigma_that_is_not_a_number_is_refused(given):
 def test_missing_reading_needs_an_infinite_sigma():
     with pytest.raises(
         DataError,
-        match=r"row 1, column 2 is nan; give a finite number, or "
+        match=r"row 1, column 2 is nan. Give a finite number, or "
         r"reading_sigma",
     ):
         Measurements("r", [[0.0, np.nan]], ())  # type: ignore[arg-type]

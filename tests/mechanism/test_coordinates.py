@@ -95,7 +95,7 @@ def test_angle_differences_are_taken_the_short_way_around():
 @pytest.mark.parametrize(
     ("names", "sentence"),
     [
-        (("x", "height"), "'height' is not a platform coordinate; allowed are x, y, z, roll"),
+        (("x", "height"), "'height' is not a platform coordinate. Allowed: x, y, z, roll"),
         (("x", "x"), "duplicate coordinate in x, x"),
         (("roll", "psi"), "roll, psi mixes roll-pitch-yaw with phi-theta-psi"),
         (("z", "theta"), "phi and theta give the direction of the normal together"),

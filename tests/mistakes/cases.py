@@ -74,7 +74,7 @@ FIVE_BAR = {
         0,
         (
             "Calibrated with reservations",
-            r"contradict the stated tolerances.*west\.length -29\d",
+            r"expected spreads suggest.*west\.length -29\d",
             "dimensions of the robot",
         ),
         ("they fit",),
@@ -82,7 +82,7 @@ FIVE_BAR = {
     "sigma is stated a thousand times too small": Mistake(
         replace_text(DATA, "noise: {x: 20 um, y: 20 um}", "noise: {x: 20 nm, y: 20 nm}"),
         2,
-        (r"exceed the stated noise by a factor of 9\d\d", "--noise estimated"),
+        (r"exceed the given noise by a factor of 9\d\d", "--noise estimated"),
         ("Outliers: [1-9]",),
     ),
 }
@@ -107,7 +107,7 @@ THREE_RRR = {
     "a column name is misspelled": Mistake(
         replace_text(DATA, "q2 [deg]", "p2 [deg]"),
         1,
-        (r"data\.csv:8: column 'p2' is unknown; allowed: .*q2",),
+        (r"data\.csv:8: column 'p2' is unknown. Allowed: .*q2",),
     ),
     "a cell has a decimal comma": Mistake(
         lambda files: files | {DATA: _with_decimal_comma(files[DATA])},
@@ -127,7 +127,7 @@ THREE_RRR = {
         command=CALIBRATE.replace("0.25", "25"),
     ),
     "one reading is missing": Mistake(
-        empty_cell("q2", 4), 1, (r"data\.csv:13: column 'q2' is empty; write its value",)
+        empty_cell("q2", 4), 1, (r"data\.csv:13: column 'q2' is empty. Write its value",)
     ),
     "the controller zeroes a motor elsewhere": Mistake(
         change_values(lambda x: x + 90.0, "q1"),
@@ -172,7 +172,7 @@ SIX_PUS = {
     "a row is pasted twice": Mistake(
         lambda files: files | {DATA: files[DATA] + files[DATA].splitlines()[-1] + "\n"},
         1,
-        ("poses '40' and '40'", "data.csv:47 and data.csv:48", "remove the copies"),
+        ("poses '40' and '40'", "data.csv:47 and data.csv:48", "Remove the copies"),
     ),
     "only six poses are measured": Mistake(
         take_rows(slice(6)), 1, ("equations cannot determine 54 parameters", "more poses")
@@ -229,7 +229,7 @@ ROTARY_DELTA = {
         0,
         (
             "Calibrated with reservations",
-            r"contradict the stated tolerances.*arm\d\.tip\.x -400",
+            r"expected spreads suggest.*arm\d\.tip\.x -400",
             "dimensions of the robot",
         ),
         ("they fit",),
@@ -251,7 +251,7 @@ ROTARY_DELTA = {
     "the angles of the robot file have a unit of length": Mistake(
         replace_text(ROBOT, "units: {length: mm, angle: deg}", "units: {length: mm, angle: mm}"),
         1,
-        (r"robot\.yaml:6: 'units\.angle' is 'mm'; allowed: 'rad'",),
+        (r"robot\.yaml:6: 'units\.angle' is 'mm'. Allowed: 'rad'",),
     ),
 }
 
@@ -301,13 +301,13 @@ HELIOSTAT = {
     "everything is held out": Mistake(
         keep_files,
         1,
-        ("while 39 poses are held out: hold out fewer",),
+        ("with 39 poses held out. Hold out fewer",),
         command=CALIBRATE.replace("0.25", "0.99"),
     ),
     "the run folder is the working folder": Mistake(
         keep_files,
         1,
-        ("this folder is the working folder", "name a new folder"),
+        ("it is the working folder", "Name a new folder"),
         command=CALIBRATE.replace("-o run", "-o ."),
     ),
 }

@@ -608,7 +608,7 @@ def test_a_hexapod_of_other_tolerances_has_sets_by_their_true_size() -> None:
 def test_a_robot_without_tolerances_is_refused(tmp_path) -> None:
     text = (ROOT / "src/loopcal/robots/hexapod-nategh-agheli.yaml").read_text("utf-8")
     (tmp_path / "mine.yaml").write_text(text.partition("tolerances:\n  base")[0], "utf-8")
-    with pytest.raises(DataError, match="has a tolerance, so that no errors were drawn"):
+    with pytest.raises(DataError, match="has an expected spread, so the true machine"):
         CASE.paper.make_case(tmp_path / "mine.yaml")
 
 
@@ -621,7 +621,7 @@ def test_one_plane_that_determines_less_than_several_is_planned_with_tolerances(
 
 
 def test_a_robot_that_cannot_follow_planes_and_lines_is_refused() -> None:
-    with pytest.raises(EstimationError, match="3-prs is not controlled in x and y"):
+    with pytest.raises(EstimationError, match="3-prs does not control x and y"):
         compute(0, 2, lambda _: None, PAPERS["cmm-constraint-2011"].make_case("3-prs"))
 
 

@@ -393,7 +393,7 @@ def test_another_epsilon_ends_the_steps_and_is_stated() -> None:
     with pytest.raises(DataError, match="epsilon is 1 for tsvd-2016"):
         PAPERS["tsvd-2016"].make_case(epsilon=1.0)
     for wrong in (np.inf, np.nan, 0.0):
-        with pytest.raises(DataError, match="give a finite number above 0, for hexapod-42 only"):
+        with pytest.raises(DataError, match="Give a finite number above 0, for hexapod-42 only"):
             paper.make_case(epsilon=wrong)
 
 

@@ -237,5 +237,5 @@ def test_an_unknown_robot_or_paper_is_refused(tmp_path, capsys):
     assert "nobody" in capsys.readouterr().err
     words = ["study", "new", path, "--paper", "cmm-constraint-2011", "--robot", "3-prs"]
     assert main(words) == 1  # before anything is written
-    assert "3-prs is not controlled in x and y" in " ".join(capsys.readouterr().err.split())
+    assert "3-prs does not control x and y" in " ".join(capsys.readouterr().err.split())
     assert not (tmp_path / "study.yaml").exists()

@@ -56,7 +56,7 @@ def test_epsilon_ends_the_steps_at_the_error_of_poses_or_at_the_size_of_a_step()
     short = identify_per_leg(robot, data, 1, epsilon=0.9 * errors[1])
     assert (short.steps, short.is_converged) == (1, False)
     for wrong in (np.nan, np.inf, -1.0):
-        with pytest.raises(EstimationError, match=f"epsilon is {wrong}; give a finite number"):
+        with pytest.raises(EstimationError, match=f"epsilon is {wrong}. Give a finite number"):
             identify_per_leg(robot, data, epsilon=wrong)
 
 

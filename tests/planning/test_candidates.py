@@ -176,7 +176,7 @@ def test_impossible_stroke_margin_is_refused(margin, words) -> None:
 
 @pytest.mark.parametrize("margin", [-1.0, np.inf, np.nan])
 def test_stroke_margin_is_a_finite_number(margin) -> None:
-    with pytest.raises(DataError, match=r"stroke_margin is .*; it must be finite, 0 m or more"):
+    with pytest.raises(DataError, match=r"stroke_margin is .*, but must be finite, 0 m or more"):
         Constraints(stroke_margin=margin)
 
 

@@ -180,7 +180,7 @@ def test_larger_share_of_machines_has_larger_errors_and_needs_more_poses():
         lengths.append(errors.position)
         rms.append(errors.position_rms)
     assert rms[0] < lengths[0] < lengths[1] < lengths[2]
-    with pytest.raises(lc.DataError, match=r"share is 0\.5; it must be a share of 0\.7 or more"):
+    with pytest.raises(lc.DataError, match=r"share is 0\.5, but must be a share of 0\.7 or more"):
         PlanOptions(share=0.5)
 
 
@@ -319,7 +319,7 @@ def test_a_plan_needs_equations_for_what_can_be_determined_and_one_to_spare():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"n_poses": 0}, "0 poses for the fit; give 1 or more"),
+        ({"n_poses": 0}, "0 poses for the fit. Give 1 or more"),
         ({"n_poses": 10, "hold_out": -1}, "-1 poses to hold out"),
     ],
 )
@@ -331,12 +331,12 @@ def test_invalid_plan_options_are_refused(tracker_problem, options, message):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"criterion": "G"}, r"criterion is G; it must be I \(.*\) or D \("),
-        ({"target": "angle"}, "target is 'angle'; .*'pose', 'position', 'orientation'"),
+        ({"criterion": "G"}, r"criterion is G, but must be I \(.*\) or D \("),
+        ({"target": "angle"}, "target is 'angle', .*'pose', 'position', 'orientation'"),
         ({"target": "angle", "goal": 1e-5}, "target is 'angle'"),
-        ({"frame": "tracker"}, "frame is 'tracker'; .*'fitted', 'base', 'relative'"),
-        ({"n_candidates": 0}, "n_candidates is 0; it must be above 0"),
-        ({"seed": -1}, "seed is -1; it must be 0 or more"),
+        ({"frame": "tracker"}, "frame is 'tracker', .*'fitted', 'base', 'relative'"),
+        ({"n_candidates": 0}, "n_candidates is 0, but must be above 0"),
+        ({"seed": -1}, "seed is -1, but must be 0 or more"),
     ],
 )
 def test_option_that_is_not_allowed_is_refused_before_anything_is_drawn(options, message):

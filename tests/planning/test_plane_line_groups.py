@@ -139,7 +139,7 @@ def test_invalid_group_settings_are_refused(robot) -> None:
         ({"points": 3}, "at least 4"),
         ({"sigma": 0.0}, "above 0"),
         ({"axes": ("w",)}, "one or more of x, y, z"),
-        ({"robot": lc.load_robot("3-prs")}, "is not controlled in x and y"),
+        ({"robot": lc.load_robot("3-prs")}, "does not control x and y"),
     ):
         given: dict[str, Any] = {"robot": robot, "points": 5, "sigma": MM} | settings
         with pytest.raises(EstimationError, match=words):

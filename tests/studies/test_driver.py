@@ -300,7 +300,7 @@ def test_threads_give_the_same_blocks(undisturbed, tmp_path, executor) -> None:
 
 
 def test_a_study_without_threads_is_refused(tmp_path) -> None:
-    with pytest.raises(EstimationError, match="threads is 0; give 1 or more"):
+    with pytest.raises(EstimationError, match=r"threads is 0. Give 1 or more"):
         loopcal.study(write_study(tmp_path), tmp_path / "study", threads=0)
     assert not (tmp_path / "study").exists()
 

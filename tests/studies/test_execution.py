@@ -76,7 +76,7 @@ def executor(request) -> Executor:
     ],
 )
 def test_numbers_of_workers_and_seconds_below_one_are_refused(make, count, tmp_path) -> None:
-    with pytest.raises(StudyError, match=f" is {count}; it must be above 0"):
+    with pytest.raises(StudyError, match=f" is {count}, but must be above 0"):
         make(count, tmp_path)
     assert not (tmp_path / "results").exists()
 

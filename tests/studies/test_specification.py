@@ -152,7 +152,7 @@ def test_poses_may_be_those_of_a_file(write, tmp_path):
     renamed = load_study(write(text.replace("poses.csv", "others.csv")))
     assert list_keys(renamed) == list_keys(study)
     for old, new, words in (
-        ("poses.csv", "none.csv", "no file"),
+        ("poses.csv", "none.csv", "lacks"),
         ("poses.csv", "others.csv, count: 3", "no other setting"),
         ("file: poses.csv", "coordinates: [[0.0, 0.0, 0.0]]", "given by a file"),
         ("file: poses.csv", "file: 3", "text is needed"),

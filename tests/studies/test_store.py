@@ -138,7 +138,7 @@ def test_second_driver_is_refused_but_may_read(folder) -> None:
 def test_folder_without_store_and_foreign_files_are_refused(tmp_path) -> None:
     with expect_refusal("store.missing", FileError), open_store(tmp_path):
         pass
-    (tmp_path / NAME).write_text("this is no database, but it has some length" * 40)
+    (tmp_path / NAME).write_text("this is not a database, but it has some length" * 40)
     for opens in (open_store, read_store):
         with expect_refusal("store.damaged", FileError), opens(tmp_path):
             pass

@@ -519,7 +519,7 @@ def simulate_accuracy(
         squares += (errors**2).sum(axis=0)
         converged += len(errors)
     if posterior is None:
-        raise EstimationError(f"none of the {trials} trials converged; check poses and method")
+        raise EstimationError(f"none of the {trials} trials converged. Check poses and method")
     predicted = pose_uncertainty(posterior, forward(posterior.robot, compared.q), point="platform")
     observed = np.sqrt(squares / converged)
     return AccuracySimulation(predicted, observed, converged, trials - converged)

@@ -28,9 +28,9 @@ def describe_wrong_share(share: float) -> str:
         return ""
     fault = f"{share:g}, which is not a share of the poses, from 0 to below 1"
     if not 1.0 <= share < 100.0:  # others were probably meant in percent, or as a number of poses
-        return f"{fault}; write 0.25 for a quarter"
+        return f"{fault}. Write 0.25 for a quarter"
     return (
-        f"{fault}; write {share / 100:g} for {share:g} %, or the number of poses to hold out "
+        f"{fault}. Write {share / 100:g} for {share:g} %, or the number of poses to hold out "
         "divided by that of all poses"
     )
 
@@ -38,7 +38,7 @@ def describe_wrong_share(share: float) -> str:
 def check_limit(name: str, limit: float | None) -> None:
     """Refuse a limit below 0, or NaN: no error could keep it, or exceed it."""
     if limit is not None and not limit >= 0.0:
-        raise DataError(f"{name} is {limit}; give a number of metres or radians, 0 or more")
+        raise DataError(f"{name} is {limit}. Give a number of metres or radians, 0 or more")
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ class CalibrationOptions:
         object.__setattr__(self, "held_out", check_labels("held_out", self.held_out))
         if self.hold_out and self.held_out:
             raise DataError(
-                f"hold_out is {self.hold_out} and held_out names {len(self.held_out)} poses; give "
+                f"hold_out is {self.hold_out} and held_out names {len(self.held_out)} poses. Give "
                 "one of the two"
             )
         if self.volume is not None:
@@ -189,7 +189,7 @@ def split_data(
         names = set(held_out)
         is_held_out = np.array([label in names for label in data.labels])
         if is_held_out.all():
-            raise DataError("all poses of the data are held out; leave some to fit")
+            raise DataError("all poses of the data are held out. Leave some to fit")
         is_repeat = is_held_out & np.isin(data.repeats, data.repeats[~is_held_out])
         repeats = tuple(data.labels[i] for i in np.flatnonzero(is_repeat))
         return DataSplit(data.take(~is_held_out), data.take(is_held_out), 0.0, seed, repeats)

@@ -215,7 +215,7 @@ def compensate(
     """
     check_choice("mode", mode, get_args(Mode), DataError)
     if steps < 1:
-        raise DataError(f"steps is {steps}; it must be 1 or more, and 3 are usually enough")
+        raise DataError(f"steps is {steps}, but must be 1 or more, and 3 are usually enough")
     source = fit.posterior if isinstance(fit, Identification) else fit
     robot, posterior = (source, None) if isinstance(source, Mechanism) else (source.robot, source)
     old = controller or robot.nominal

@@ -199,7 +199,7 @@ def judge_estimate(
     if not (np.isfinite(estimate) and uncertainty >= 0.0 and degrees > 0.0):
         raise EstimationError(
             f"an estimate of {estimate} with the uncertainty {uncertainty} and {degrees} degrees "
-            "of freedom cannot be compared; give finite numbers, and an uncertainty of 0 or more"
+            "of freedom cannot be compared. Give finite numbers, and an uncertainty of 0 or more"
         )
     if uncertainty == 0.0:
         p, x = float(estimate <= limit), estimate
@@ -236,7 +236,7 @@ def judge_largest_error(
     _check_level(level)
     mean, noise = _rotate(components, covariance)
     if not len(mean):
-        raise EstimationError("no error is measured, so none can be compared with a limit")
+        raise EstimationError("the data contain no error to compare with a limit")
     # what exceeds the stated noise may be an error of the machine
     large = _find_distribution(mean, noise, min(noise_scale, 1.0), noise_degrees, LARGE).below
     by_spread = _find_distribution(mean, noise, noise_scale, noise_degrees, SMALL)
@@ -354,7 +354,7 @@ def _check_level(level: float) -> None:
     """Refuse a level at which conformity and nonconformity could both be decided."""
     if not 0.5 < level < 1.0:
         raise EstimationError(
-            f"the conformity level is {level}; give a probability above 0.5 and below 1"
+            f"the conformity level is {level}. Give a probability above 0.5 and below 1"
         )
 
 

@@ -81,7 +81,7 @@ SOURCE_WORDS = {
     "residuals.depend-on-temperature": "temperature",
     "residuals.depend-on-reading": "dependence on a reading",
     INFLATION: "factor on the tolerances",
-    "noise.setup-as-stated": "stated setup parameters and common errors",
+    "noise.setup-as-stated": "setup parameters and common errors",
 }
 
 

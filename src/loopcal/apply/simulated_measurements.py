@@ -83,7 +83,7 @@ def simulate_measurements(
         skipped = tuple(name for name, keep in zip(numbers, is_kept, strict=True) if not keep)
         if len(skipped) == len(targets):
             raise DataError(
-                f"{robot.name} reaches none of {len(targets)} poses; correct the poses or the "
+                f"{robot.name} reaches none of {len(targets)} poses. Correct the poses or the "
                 "strokes in the robot file"
             )
         if skipped:
@@ -192,7 +192,7 @@ def build_instrument(
             )
         if name in description.kinds[:i]:
             raise DataError(
-                f"the kind {name!r} is named twice; name it once, and add the second one to the "
+                f"the kind {name!r} is named twice. Name it once, and add the second one to the "
                 "measurement file by hand"
             )
         fields = _setting_names(name)
@@ -206,7 +206,7 @@ def build_instrument(
         if description.targets and not isinstance(kind, TargetKind):
             able = ", ".join(name for name, known in KINDS.items() if issubclass(known, TargetKind))
             raise DataError(
-                f"the kind {kind.name!r} measures no targets; leave out the targets, or choose one "
+                f"the kind {kind.name!r} measures no targets. Leave out the targets, or choose one "
                 f"of {able}"
             )
         if description.targets:
@@ -223,11 +223,11 @@ def build_instrument(
         if not any(setting in _setting_names(name) for name in description.kinds):
             kinds = ",".join(description.kinds)
             raise DataError(
-                f"the setting {setting!r} does not belong to the kind {kinds!r}; remove it, or "
+                f"the setting {setting!r} does not belong to the kind {kinds!r}. Remove it, or "
                 "choose another kind"
             )
     if description.sigma_scale is not None and not stated:
-        raise DataError("the instrument measures angles, which have no scale; remove its sigma")
+        raise DataError("the instrument measures angles, which have no scale. Remove its sigma")
     return Instrument(tuple(sensors), tuple(stated))
 
 
@@ -243,12 +243,12 @@ def _name_unknown_frames(frames: Sequence[str], kind: object) -> tuple[str, ...]
     for frame in frames:
         if frame not in FRAMES:
             raise DataError(
-                f"{frame!r} is not a frame that can be unknown; allowed are base, tool, or both"
+                f"{frame!r} is not a frame that can be unknown. Allowed: base, tool, or both"
             )
         names_of_frame = [name for name in FRAMES[frame] if name in possible]
         if not names_of_frame:
             raise DataError(
-                f"this kind of measurement has no {frame} frame that could be unknown; remove it"
+                f"this kind of measurement has no {frame} frame that could be unknown. Remove it"
             )
         names.append(names_of_frame[0])
     return tuple(names)

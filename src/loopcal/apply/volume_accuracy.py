@@ -82,16 +82,16 @@ class Volume:
 
     def __post_init__(self) -> None:
         if (self.points is None) != bool(self.ranges or self.values or self.radius is not None):
-            state = "nothing" if self.points is None else "a list of points beside other parts"
-            raise DataError(f"the volume states {state}; give {EXAMPLE}")
+            state = "nothing" if self.points is None else "points with other parts"
+            raise DataError(f"the volume contains {state}. Give {EXAMPLE}")
         for name, (low, high) in self.ranges.items():
             if name in self.values or not -math.inf < low < high < math.inf:
                 raise DataError(f"give {name} of the volume one range, the lower end first")
         for name, values in self.values.items():
             if not len(check_array(values, f"the values of {name} in the volume", (None,))):
-                raise DataError(f"the volume has no value of {name}; give one, or leave it out")
+                raise DataError(f"the volume has no value of {name}. Give one, or leave it out")
         if self.radius is not None and not 0.0 < self.radius < math.inf:
-            raise DataError(f"the radius of the volume is {self.radius:g} m; give one above 0")
+            raise DataError(f"the radius of the volume is {self.radius:g} m. Give one above 0")
 
     def find_circle(self, robot: Mechanism) -> tuple[str, ...]:
         """Return the two coordinates of the circle of a cylinder; none of other volumes."""
@@ -101,7 +101,7 @@ class Volume:
         if len(free) < 2 or any(len(self.values.get(name, [0.0])) != 1 for name in free):
             raise DataError(
                 f"a radius needs two of x, y, z that {robot.name} is commanded in, without a range "
-                "and with one value as center; leave out a range, or the radius"
+                "and with one value as center. Leave out a range, or the radius"
             )
         return tuple(free)
 
@@ -148,7 +148,7 @@ class Volume:
         fine = (1 + 2**k for k in range(12 if spans else 1))
         counts = [count for count in fine if fixed * count ** len(spans) <= MOST_POINTS]
         if not counts:
-            raise DataError(f"the volume has more than {MOST_POINTS:,} points; give fewer values")
+            raise DataError(f"the volume has more than {MOST_POINTS:,} points. Give fewer values")
         for count in counts[1:] if len(counts) > 2 else counts:
             points, reasons = self.list_points(robot, count), Counter[str]()
             reached, _ = find_reachable(robot, points, reasons)
@@ -159,7 +159,7 @@ class Volume:
                 reason = ""
         if reason:
             raise EstimationError(
-                f"{robot.name} reaches no point of this volume ({reason}); state another volume"
+                f"{robot.name} reaches no point of this volume ({reason}). Give another volume"
             )
 
     def describe(self, robot: Mechanism) -> dict[str, Any]:
@@ -212,14 +212,14 @@ def parse_volume_part(text: str) -> tuple[str, Any]:
     """
     name, _, stated = text.partition("=")
     if not (name and stated):
-        raise UnitError(f"{text!r} is no file and no part of a volume; give {EXAMPLE}")
+        raise UnitError(f"{text!r} is neither a file nor a part of a volume. Give {EXAMPLE}")
     if name == RADIUS:
         return name, parse_quantity(stated, LENGTH)
     is_range = ".." in stated
     ends = stated.split(".." if is_range else ",")
     numbers = [parse_quantity(number, get_dimension(name)) for number in ends]
     if is_range and not (len(numbers) == 2 and numbers[0] < numbers[1]):
-        raise UnitError(f"{text!r} is no range; give the smaller end first, as x=-40mm..40mm")
+        raise UnitError(f"{text!r} is not a range. Give the smaller end first, as x=-40mm..40mm")
     return name, tuple(numbers) if is_range else numbers
 
 
@@ -231,7 +231,7 @@ def join_volume(parts: Iterable[tuple[str, Any]]) -> Volume:
     stated: dict[str, Any] = {}
     for name, value in parts:
         if name in stated:
-            raise DataError(f"the volume states {name} twice; keep one of the two")
+            raise DataError(f"the volume contains {name} twice. Keep one of the two")
         stated[name] = value
     others = {name: stated.pop(name, None) for name in (RADIUS, POINTS)}
     ranges = {name: value for name, value in stated.items() if isinstance(value, tuple)}
@@ -390,8 +390,8 @@ def _draw_errors(
     single = compute(solution)
     if not np.isfinite(single.position).all():
         raise EstimationError(
-            "the measurements do not determine the position error in this volume; measure more "
-            "poses, or state the error in another frame"
+            "the measurements do not determine the position error in this volume. Measure more "
+            "poses, or use another frame"
         )
     root = posterior.without_discrepancy.root / posterior.unit[:, None]
     # effects of each pose alone: those of a discrepancy, and of an approach to each

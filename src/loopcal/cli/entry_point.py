@@ -53,11 +53,11 @@ SECTIONS = {
         "report": ("calibration", "Write the report of a calibration as HTML, JSON and PDF."),
         "validate": ("calibration", "Validate a calibration, or a robot file, with measurements."),
         "repeatability": ("calibration", "Compute pose accuracy and repeatability by ISO 9283."),
-        "accuracy": ("calibration", "State the largest position error in a volume."),
+        "accuracy": ("calibration", "Compute the largest position error in a volume."),
         "budget": ("calibration", "Show the uncertainty of a calibration by source."),
         "compare": (
             "calibration",
-            "Compare calibrations side by side: has the machine changed, and where?",
+            "Compare calibrations side by side: has the machine changed, and in which part?",
         ),
         "certificate": ("calibration", "Print a digital calibration certificate of a calibration."),
         "compensate": ("calibration", "Compute readings or commands that reach targets."),
@@ -190,7 +190,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             if isinstance(command, click.Group) and len(words) > 1:
                 command = command.commands.get(words[1], command)
             if command is not None and not _has_working_folder():
-                sentence = "the working folder was removed; change to a folder that exists."
+                sentence = "the working folder was removed. Change to a folder that exists."
                 return _refuse(sentence, words)
             code = command_line.main(words, "loopcal", standalone_mode=False, obj=words)
             terminal.flush_output()
@@ -221,7 +221,7 @@ def _report(
     if outputs:
         names = " and ".join(str(path) for path in outputs)
         terminal.print_message(f"loopcal: written completely before the following: {names}")
-    unwritten = "" if outputs else "; no result was written"
+    unwritten = "" if outputs else ", without a result"
     hint = None
     match error:
         case click.exceptions.NoArgsIsHelpError():
@@ -242,11 +242,11 @@ def _report(
             place = f"{error.filename}: " if error.filename else ""
             reason = (error.strerror or str(error)).lower()
             sentence = (
-                f"{place}the operating system refused ({reason}); check the path and its "
+                f"{place}the operating system refused ({reason}). Check the path and its "
                 "permissions."
             )
         case MemoryError():
-            sentence = "there is not enough memory for this; use fewer poses at a time."
+            sentence = "there is not enough memory for this. Use fewer poses at a time."
         case _:
             _refuse(describe_defect(error, words), words)
             return 3
@@ -331,11 +331,11 @@ def describe_defect(error: BaseException, words: Sequence[str]) -> str:
     path = save_report("\n".join(lines))
     if path is None:
         return (
-            f"{sentence}; no report could be saved: send the developers this message, the command "
-            f"and the version {versions['loopcal']}"
+            f"{sentence}. The report could not be saved: send the developers this message, the "
+            f"command and the version {versions['loopcal']}"
         )
     return (
-        f"{sentence}; please read {path}, which contains the command, versions and the Python "
+        f"{sentence}. Read {path}, which contains the command, versions and the Python "
         "traceback, and send it to the developers together with the input files"
     )
 

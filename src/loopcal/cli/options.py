@@ -185,7 +185,7 @@ def _quantity(dimension: Dimension, is_positive: bool = False) -> Parsed:
     def parse(text: str) -> float:
         number = parse_quantity(text, dimension)
         if is_positive and not number > 0.0:
-            raise UnitError(f"{text!r} is not above 0; give a positive number")
+            raise UnitError(f"{text!r} is not above 0. Give a positive number")
         return number
 
     def show(value: float) -> str:
@@ -225,7 +225,7 @@ def _parse_pose_share(text: str) -> float:
         share = float(text)
     except ValueError:
         allowed = "a share of the poses is a number from 0 to below 1, such as 0.25 for 25 %"
-        raise DataError(f"{text!r} is no number; {allowed}.") from None
+        raise DataError(f"{text!r} is not a number: {allowed}.") from None
     if fault := describe_wrong_share(share):
         raise DataError(f"it is {fault}.")
     return share
@@ -267,7 +267,7 @@ class Count(click.IntRange):
 
         number, limit = super().convert(value, param, ctx), getattr(limits, self.limit)
         if number > limit.most:
-            self.fail(f"the limit is {limit}; give a smaller number.", param, ctx)
+            self.fail(f"the limit is {limit}. Give a smaller number.", param, ctx)
         return int(number)
 
 
@@ -320,7 +320,7 @@ def _refuse_yaml(_context: click.Context, _argument: click.Parameter, paths: Any
     """Refuse a YAML file, such as a robot file, in place of measurements."""
     for path in paths if isinstance(paths, tuple) else () if paths is None else (paths,):
         if path.suffix in (".yaml", ".yml"):
-            raise DataError(f"{path} is a YAML file; give a measurement file (CSV)")
+            raise DataError(f"{path} is a YAML file. Give a measurement file (CSV)")
     return paths
 
 
@@ -349,7 +349,7 @@ VERBOSE: Any = flag("Print all findings and tables, not only the summary.", "-v"
 def frame(of: str, names: str = "fitted, base, relative, or the frame of an instrument") -> Any:
     """Declare the option for the frame in which a function `of` states errors."""
     help_text = (
-        f"Frame in which errors are stated: {names}. 'fitted' is after the best rigid fit of "
+        f"Frame of the errors: {names}. 'fitted' is after the best rigid fit of "
         "the base and platform frames, as far as the measurements do not determine them."
     )
     return option(help_text, of=of, metavar="NAME")
@@ -365,9 +365,9 @@ def _parse_volume(text: str) -> tuple[str, Any]:
 def volume(**settings: Any) -> Any:
     """Declare the option for a working volume, of which `read_volume` makes one value."""
     return option(
-        "Volume in which the largest position error is stated: x=-40mm..40mm for a range of a "
-        "controlled coordinate, radius=40mm for a cylinder, theta=0deg,5deg for single values; or "
-        "a CSV file of points. Give each part; other coordinates stay at home.",
+        "Volume for the largest position error: x=-40mm..40mm for a range of a controlled "
+        "coordinate, radius=40mm for a cylinder, theta=0deg,5deg for single values, or a CSV file "
+        "of points. Give each part. Other coordinates stay at home.",
         type=Parsed("volume", _parse_volume),
         multiple=True,
         metavar="PART|FILE",
@@ -386,7 +386,7 @@ def read_volume(parts: Parts, robot: lc.Mechanism) -> lc.Volume | None:
 
 def _limit(kind: Parsed, quantity: str, where: str, example: str) -> Any:
     text = f"Largest allowed {quantity} error on poses that were not fitted{where}"
-    return option(f"{text}, such as {example}; above it the exit code is 2.", type=kind)
+    return option(f"{text}, such as {example}. Above it the exit code is 2.", type=kind)
 
 
 LIMIT_POSITION = _limit(POSITIVE_LENGTH, "position", " or in a volume", "0.02mm")
@@ -406,8 +406,8 @@ def profile(help: str, **settings: Any) -> Any:  # noqa: A002
 
 
 DECIMAL: Any = option(
-    "Decimal mark of the export; with comma, semicolons separate columns in place of commas.  "
-    "[default: as the profile states]",
+    "Decimal mark of the export. With comma, semicolons separate columns.  [default: from the "
+    "profile]",
     type=click.Choice(("point", "comma")),
 )
 
@@ -445,7 +445,7 @@ def name_option(name: str) -> str:
 def refuse_given(
     names: Iterable[str],
     reason: str,
-    sentence: str = "{option} has no effect {reason}; leave it out",
+    sentence: str = "{option} has no effect {reason}. Leave it out",
 ) -> None:
     """Raise DataError for the first of these options that the user stated; the reason is a clause
     of the sentence, such as "because ..." or "with --profile".
@@ -555,7 +555,7 @@ def _make_fit_options(stated: Mapping[str, Any]) -> lc.FitOptions:
 
     if (foreign := find_foreign_setting(stated)) is not None:
         raise DataError(
-            f"--{foreign[0]} belongs to --method {foreign[1]}, not to {stated['method']}; leave it "
+            f"--{foreign[0]} belongs to --method {foreign[1]}, not to {stated['method']}. Leave it "
             "out, or change the method"
         )
     return lc.FitOptions.from_dict(stated)
@@ -577,7 +577,7 @@ def _parse_weights(text: str) -> float | dict[str, float]:
         0.0 <= weight < float("inf") for weight in weights.values()
     ):
         raise DataError(
-            f"{text!r} states no weights of 0 or more, each pattern once; write a number, "
+            f"{text!r} is not a list of weights of 0 or more, each pattern once. Write a number, "
             "'*.length=1,*=0.01', or a YAML file with lines '*.length: 1'"
         )
     return weights.pop("") if list(weights) == [""] else weights
@@ -593,7 +593,7 @@ def _describe_methods() -> str:
         for name, method in METHODS.items()
         if name != "auto"
     )
-    auto = "auto: map, with tolerances inflated where the data contradict them"
+    auto = "auto: map, with inflated expected spreads if the data contradict them"
     return f"{'. '.join((auto, *others))}."
 
 
@@ -603,31 +603,31 @@ FIT: Any = Group(
         _describe_methods, type=Words("loopcal.estimate.methods:METHODS"), default="auto"
     ),
     inflation=option(
-        "For auto: which tolerances may be inflated. global: all by one factor. groups: also "
-        "limbs and types of parameters, and what these have in common. heavy-tailed: also single "
-        "parameters. auto, the default: all of these. none: as stated.",
+        "For auto: which expected spreads the fit may inflate. global: all by one factor. groups: "
+        "also limbs and types of parameters, and their common deviations. heavy-tailed: also "
+        "single parameters. auto, the default: all of these. none: as given.",
         type=Words("loopcal.estimate.tolerance_components:By", "none"),
     ),
     lam=option(
-        "For ridge: weight of the penalty; by default chosen by cross-validation. Or a weight for "
-        "each parameter: patterns such as '*.length=1,*=0.01', or a YAML file of such lines "
-        "'*.length: 1'; the most exact pattern counts, and 0 where none fits.",
+        "For ridge: weight of the penalty. Default: by cross-validation. Or a weight for each "
+        "parameter: patterns such as '*.length=1,*=0.01', or a YAML file of such lines '*.length: "
+        "1'. The most exact pattern counts. The weight of others is 0.",
         type=Parsed("weight", _parse_weights),
         metavar="WEIGHT",
     ),
     keep=option(
-        "For truncated-svd: number of directions; by default chosen by cross-validation.",
+        "For truncated-svd: number of directions. Default: by cross-validation.",
         type=click.IntRange(min=0),
         metavar="K",
     ),
     noise=option(
-        "Take the stated sigmas as true, or as true up to one common factor that is estimated.",
+        "Take the given sigmas as true, or estimate one common factor.",
         of=_FIT,
         type=Words("loopcal.estimate.options:Noise"),
     ),
     sigma_uncertainty=option(
-        "Relative standard uncertainty of given sigmas, which the intervals account for; 0 "
-        "takes them as exact.",
+        "Relative standard uncertainty of given sigmas, which the intervals include. 0 takes them "
+        "as exact.",
         of=_FIT,
         type=SHARE,
     ),
@@ -638,7 +638,7 @@ FIT: Any = Group(
     ),
     rank_tolerance=RANK_TOLERANCE,
     excluded_poses=option(
-        "Exclude this pose from fit and validation. May be given several times.",
+        "Exclude this pose from fit and validation. Repeatable.",
         "--drop",
         multiple=True,
         metavar="POSE",
@@ -652,8 +652,8 @@ _INSTRUMENT = f"{SIMULATION}:InstrumentDescription"
 
 INSTRUMENT: Any = Group(
     kinds=option(
-        "Kind of measurement: pose, component, position, bearing, ...; or several, such "
-        "as position,inclination.",
+        "Kind of measurement: pose, component, position, bearing, ..., or several, such as "
+        "position,inclination.",
         "--kind",
         of=_INSTRUMENT,
         type=NAMES,
@@ -701,21 +701,21 @@ UNKNOWN: Any = Group(
 """The short form of components, and unknown frames and targets, for `make_instrument`."""
 
 DRAW: Any = option(
-    "Number of poses to draw evenly from the workspace where no poses are given.",
+    "Number of poses to draw evenly from the workspace, without other poses.",
     of=f"{SIMULATION}:DRAWN",
     type=Count("DRAWN_POSES", 1),
 )
 
 EPSILON: Any = option(
-    "End the steps when the largest error of a pose after a step, max dQint = position error [mm] "
-    "+ angle [rad], is at most this number.",
+    "End the steps when the largest error of a pose, max dQint = position error [mm] + angle "
+    "[rad], is at most this number.",
     type=click.FloatRange(0, math.inf, min_open=True, max_open=True),
     metavar="NUMBER",
 )
 
 DISTRIBUTION: Any = option(
     "Distribution of the noise of measured values. Uniform noise lies within sqrt(3) = 1.732 "
-    "standard deviations; a limit of 1 um is --sigma-position 0.57735um.",
+    "standard deviations: a limit (MPE) of 1 um is --sigma-position 0.57735um.",
     of=_INSTRUMENT,
     type=Words("loopcal.measure.instrument:Distribution"),
 )
@@ -740,7 +740,7 @@ def make_instrument(stated: Mapping[str, Any], robot: lc.Mechanism | None = None
     if (components := described.pop("measure", None)) is not None:
         if "components" in described or described["kinds"] != ("pose",):
             raise DataError(
-                "--measure is short for --kind component --components; give one or the other"
+                "--measure is short for --kind component --components. Give one or the other"
             )
         described |= {"kinds": ("component",), "components": components}
         if {"phi", "theta", "psi"}.intersection(components):
@@ -781,7 +781,7 @@ def parse_reading_sigma(text: str | None, robot: lc.Mechanism) -> FloatArray | N
         name, equals, number = part.rpartition("=")
         if equals and name not in sigma:
             raise DataError(
-                f"--sigma-reading names {name!r}{suggest_names(name, sigma)}; the actuators of "
+                f"--sigma-reading names {name!r}{suggest_names(name, sigma)}. The actuators of "
                 f"{robot.name} are {', '.join(sigma)}"
             )
         for actuator in (name,) if equals else tuple(sigma):
@@ -791,7 +791,7 @@ def parse_reading_sigma(text: str | None, robot: lc.Mechanism) -> FloatArray | N
                 raise DataError(f"--sigma-reading {number!r} for {actuator}: {error}") from None
             if not 0.0 <= sigma[actuator] < np.inf:
                 raise DataError(
-                    f"--sigma-reading for {actuator} is {number}; give a number above zero, or "
+                    f"--sigma-reading for {actuator} is {number}. Give a number above zero, or "
                     "zero for exact readings"
                 )
     return np.array(list(sigma.values()))
@@ -809,7 +809,7 @@ def _make_constraints(stated: Mapping[str, Any]) -> lc.Constraints:
     if stated["seen_from"] is None:
         refuse_given(
             ("facing", "cone", "nearest", "farthest"),
-            "state the position of the instrument with --seen-from",
+            "give the position of the instrument with --seen-from",
             "{option} belongs to a line of sight; {reason}",
         )
         return lc.Constraints(stated["min_margin"], stated["max_tilt"], None, **margins)
@@ -837,7 +837,7 @@ def _parse_three(text: str, option: str, dimension: Dimension | None) -> FloatAr
         numbers, reason = [], f" ({error})"
     if len(numbers) != 3:
         example = "0,0,1" if dimension is None else "1.5m,-0.8m,1.1m"
-        raise DataError(f"{option} is {text!r}{reason}; give three numbers, such as {example}")
+        raise DataError(f"{option} is {text!r}{reason}. Give three numbers, such as {example}")
     return np.array(numbers)
 
 
@@ -849,8 +849,8 @@ CONSTRAINTS: Any = Group(
         type=float,
     ),
     stroke_margin=option(
-        "Distance of all readings from both ends of their strokes, such as 5mm; 2deg for "
-        "actuators that turn.",
+        "Distance of all readings from both ends of their strokes, such as 5mm, or 2deg for "
+        "rotary actuators.",
         type=GOAL,
     ),
     max_tilt=option("Largest tilt of the platform, such as 20deg.", type=ANGLE),

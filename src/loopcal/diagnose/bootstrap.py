@@ -289,7 +289,7 @@ def choose_blocks(data: Measurements, unit: str | int | None = None) -> Clusters
         return runs
     if unit is not None and unit not in UNITS:
         raise EstimationError(
-            f"unit is {unit!r}; it must be one of {', '.join(UNITS)}, or a number of consecutive "
+            f"unit is {unit!r}, but must be one of {', '.join(UNITS)}, or a number of consecutive "
             "poses"
         )
     divisions = divide_into_clusters(data)

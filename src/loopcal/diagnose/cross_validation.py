@@ -197,7 +197,7 @@ def _fit_folds(
     """
     if options.nuisance is not None:
         raise EstimationError(
-            "cross_validate does not support the option nuisance; state known frames and targets "
+            "cross_validate does not support the option nuisance. Give known frames and targets "
             "in the measurements"
         )
     data = exclude_poses(fill_in_reading_sigma(robot, data), options.excluded_poses)
@@ -226,7 +226,7 @@ def score_leave_one_out(
     problem = problem_of(free, data)
     if problem.nuisance is not None:
         raise EstimationError(
-            "leave-one-out of many methods needs known frames and targets; state them, or use "
+            "leave-one-out of many methods needs known frames and targets. Give them, or use "
             "cross_validate"
         )
     z = free.deviation(robot.values[None])
@@ -236,7 +236,7 @@ def score_leave_one_out(
     adapted = [adapt_method(method, free.names, stated, "given") for method in methods]
     if any(method.root(len(free)) is not None for method in adapted):
         raise EstimationError(
-            "leave-one-out of many methods penalizes all parameters alike; use cross_validate for "
+            "leave-one-out of many methods penalizes all parameters alike. Use cross_validate for "
             "one lam per parameter"
         )
     penalty = np.concatenate([method.penalty(d) for method in adapted])
@@ -459,7 +459,7 @@ def choose_model(
     for (small, inner), (large, outer) in pairwise(named):
         if nested is not None and not set(inner) < set(outer):
             raise EstimationError(
-                f"the set {small!r} is not within {large!r}, or equal to it; give each set within "
+                f"the set {small!r} is not within {large!r}, or equal to it. Give each set within "
                 "the next"
             )
     options = merge_options(options, method)

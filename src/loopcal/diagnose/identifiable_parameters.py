@@ -337,7 +337,9 @@ def identifiability(
         Poses are to be drawn, but the robot states no workspace.
     """
     if not 0.0 < rank_tolerance < 1.0:
-        raise EstimationError(f"rank_tolerance is {rank_tolerance}; it must be above 0 and below 1")
+        raise EstimationError(
+            f"rank_tolerance is {rank_tolerance}, but must be above 0 and below 1"
+        )
     if isinstance(data, Instrument):
         coordinates = sample_workspace(robot, poses, seed).coordinates
         data = simulate(robot, coordinates, data, seed=0, controller=robot)
@@ -801,7 +803,7 @@ def judge_useful_accuracy(
     angle = length / free.robot.size if angle is None else angle
     for name, value in (("length", length), ("angle", angle)):
         if not 0.0 < value < np.inf:
-            raise EstimationError(f"useful {name} is {value}; give a finite number above 0")
+            raise EstimationError(f"useful {name} is {value}. Give a finite number above 0")
     units = {Dimension.LENGTH: length, Dimension.ANGLE: angle}
     ratio = length / free.robot.size
     unit = np.array([units.get(parameter.dimension, ratio) for parameter in free.parameters])

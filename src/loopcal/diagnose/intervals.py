@@ -449,7 +449,7 @@ def _select(
     """Return the selected quantities; raise EstimationError where they are not determined."""
     posterior = fit if isinstance(fit, Posterior) else fit.posterior
     if not 0.0 < level < 1.0:
-        raise EstimationError(f"level is {level}; give a probability between 0 and 1")
+        raise EstimationError(f"level is {level}. Give a probability between 0 and 1")
     if np.isnan(posterior.variance).any():
         raise EstimationError(report_finding("sampling.without-intervals"))
     size = np.abs(posterior.directions[:, np.isinf(posterior.variance)]).max(axis=1, initial=0.0)
@@ -466,12 +466,12 @@ def _select(
         rows = np.atleast_2d(np.asarray(combinations, dtype=np.float64))
         if rows.ndim != 2 or rows.shape[1] != len(places):
             raise EstimationError(
-                f"combinations have shape {rows.shape} for {len(places)} parameters; give rows "
+                f"combinations have shape {rows.shape} for {len(places)} parameters. Give rows "
                 "with one factor for each"
             )
         if not np.isfinite(rows).all() or not rows.any(axis=1).all():
             raise EstimationError(
-                "combinations have a row of zeros, or a number that is not finite; give finite "
+                "combinations have a row of zeros, or a number that is not finite. Give finite "
                 "factors, not all of them 0"
             )
         effect, labels = rows @ effect, tuple(f"combination {i + 1}" for i in range(len(rows)))

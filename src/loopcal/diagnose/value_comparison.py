@@ -228,7 +228,7 @@ def compare_with_truth(fit: Identification, truth: ArrayLike) -> ValueComparison
     if true.shape not in ((p,), (total,)) or not np.isfinite(true).all():
         problem = "" if np.isfinite(true).all() else " and numbers that are not finite"
         raise EstimationError(
-            f"the truth has shape {true.shape}{problem}; give {total} values for all parameters of "
+            f"the truth has shape {true.shape}{problem}. Give {total} values for all parameters of "
             f"{fit.robot.name!r}, or {p} for the free ones"
         )
     true = true[fit.free_parameters.places] if len(true) == total else true
@@ -272,7 +272,7 @@ def compare_with_values(
             hint = suggest_names(str(name), table.names)
             raise EstimationError(f"{name!r} is not a parameter of {fit.robot.name!r}{hint}")
         if not np.isfinite(value):
-            raise EstimationError(f"the value of {name!r} is {value}; give a finite number")
+            raise EstimationError(f"the value of {name!r} is {value}. Give a finite number")
         if name not in fit.names:
             place = table.index(name)
             kept, dimension = float(fit.robot.values[place]), table.dimensions[place]
@@ -286,7 +286,7 @@ def compare_with_values(
     indices = [i for i, name in enumerate(fit.names) if name in values]
     if not indices:
         raise EstimationError(
-            f"no value belongs to an estimated parameter of {fit.robot.name!r}; give some of "
+            f"no value belongs to an estimated parameter of {fit.robot.name!r}. Give some of "
             f"{', '.join(fit.names)}"
         )
     return _compare(fit, np.array(indices), np.array([values[fit.names[i]] for i in indices]))
@@ -303,7 +303,7 @@ def refuse_other_dimensions(
     called, given = names or (robot.name, stored.name)
     if stored.parameters.names != robot.parameters.names:
         raise EstimationError(
-            f"{stored.name!r} does not have the parameters of {robot.name!r}; give a robot file of "
+            f"{stored.name!r} does not have the parameters of {robot.name!r}. Give a robot file of "
             "the same family and structure, or only the values to compare"
         )
     for machine in (robot, stored):

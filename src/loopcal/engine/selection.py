@@ -107,7 +107,7 @@ def select_engine(choice: str = "") -> Engine:
         if not isinstance(engine, Engine):
             raise TypeError(f"{engine!r} is no engine")
     except Exception as cause:  # the code of others, or a record of functions of another version
-        reason = "it belongs to another version of loopcal, or fails; install both anew"
+        reason = "it belongs to another version of loopcal, or fails. Install both anew"
         if isinstance(cause, ImportError | OSError | ValueError):  # their texts say what to do
             reason = str(cause)
         finding = report_finding("engine.not-usable", engine=choice, reason=reason)

@@ -269,12 +269,12 @@ class StepControl:
         for name in ("relative", "absolute"):
             if not 0.0 < getattr(self, name) < np.inf:
                 raise EstimationError(
-                    f"{name} is {getattr(self, name)}; give a finite number above 0"
+                    f"{name} is {getattr(self, name)}. Give a finite number above 0"
                 )
         if self.iterations < 0:
-            raise EstimationError(f"iterations is {self.iterations}; give 0 or more")
+            raise EstimationError(f"iterations is {self.iterations}. Give 0 or more")
         if not 0.0 <= self.damping < np.inf:
-            raise EstimationError(f"damping is {self.damping}; give 0 or a finite number above it")
+            raise EstimationError(f"damping is {self.damping}. Give 0 or a finite number above it")
 
 
 @dataclass(frozen=True, eq=False)

@@ -118,7 +118,7 @@ def prepare_fitted_data(fit: Identification, data: Measurements) -> Measurements
     if data.n_poses != len(fit.pose_weights):
         raise DataError(
             f"the data have {data.n_poses} poses, but the fit was made from "
-            f"{len(fit.pose_weights)}; give the measurements that were fitted, without held-out "
+            f"{len(fit.pose_weights)}. Give the measurements that were fitted, without held-out "
             "poses"
         )
     return exclude_poses(fill_in_reading_sigma(fit.robot, data), fit.options.excluded_poses)
@@ -134,7 +134,7 @@ def exclude_poses(data: Measurements, excluded: Sequence[str]) -> Measurements:
     for label in excluded:
         if label not in known:
             raise DataError(
-                f"no pose {label!r} to exclude{suggest_names(label, data.labels)}; give labels of "
+                f"no pose {label!r} to exclude{suggest_names(label, data.labels)}. Give labels of "
                 "poses in the data"
             )
     kept = np.array([label not in unwanted for label in data.labels])
@@ -690,13 +690,13 @@ def identify_trials(
     check_type(trials, Trials, "trials", "as from simulate_trials(...)")
     check_threads(threads)
     if not len(trials):
-        raise EstimationError("there are no trials; simulate at least one machine")
+        raise EstimationError("there are no trials. Simulate at least one machine")
     options = merge_options(options, method)
     for name in ("loss", "prior", "nuisance", "excluded_poses"):
         value = getattr(options, name)
         if value is not None and value != ():
             raise EstimationError(
-                f"identify_trials does not support the option {name}; remove it, or call identify "
+                f"identify_trials does not support the option {name}. Remove it, or call identify "
                 "for every trial"
             )
     free = select_free_parameters(robot)
@@ -721,7 +721,7 @@ def check_threads(threads: int) -> None:
     """Raise EstimationError unless `threads` is a whole number of at least 1."""
     check_type(threads, Integral, "threads", "a whole number, 1 or more")
     if threads < 1:
-        raise EstimationError(f"threads is {threads}; give 1 or more")
+        raise EstimationError(f"threads is {threads}. Give 1 or more")
 
 
 def _fit_parts(

@@ -57,7 +57,7 @@ def register_loss(loss: type[L]) -> type[L]:
     DataError : there is no function `weight` or no name, or the name is one of loopcal.
     """
     if not callable(getattr(loss, "weight", None)):
-        raise DataError(f"{loss!r} is no loss: it has no function 'weight(distance, degrees)'")
+        raise DataError(f"{loss!r} is not a loss: it has no function 'weight(distance, degrees)'")
     return LOSSES.register(loss)
 
 

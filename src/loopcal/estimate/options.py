@@ -93,17 +93,17 @@ class FitOptions:
         _check_choice("begin", self.begin, get_args(Begin))
         if not 0.0 <= self.sigma_uncertainty <= 1.0:
             raise EstimationError(
-                f"sigma_uncertainty is {self.sigma_uncertainty}; it must be from 0 (the stated "
-                "sigmas are exact) to 1"
+                f"sigma_uncertainty is {self.sigma_uncertainty}, but must be from 0 (the "
+                f"given sigmas are exact) to 1"
             )
         if self.method is not None and not _is_instance_with(self.method, METHOD_PARTS):
             raise EstimationError(
-                f"method is {self.method!r}; it must be an instance such as MAP(), "
+                f"method is {self.method!r}, but must be an instance such as MAP(), "
                 "LeastSquares(), Ridge(1.0) or TruncatedSVD(10)"
             )
         if self.loss is not None and not _is_instance_with(self.loss, ("weight",)):
             raise EstimationError(
-                f"loss is {self.loss!r}; it must be an instance such as Huber() or Tukey()"
+                f"loss is {self.loss!r}, but must be an instance such as Huber() or Tukey()"
             )
         if self.prior is not None:
             check_type(self.prior, Prior, "prior", "as from prior_from(fit.posterior)")
@@ -113,7 +113,7 @@ class FitOptions:
             check_type(self.nuisance, NuisanceParameters, "nuisance", wanted)
         if not 0.0 < self.rank_tolerance < 1.0:
             raise EstimationError(
-                f"rank_tolerance is {self.rank_tolerance}; it must be above 0 and below 1"
+                f"rank_tolerance is {self.rank_tolerance}, but must be above 0 and below 1"
             )
         object.__setattr__(
             self, "excluded_poses", check_labels("excluded_poses", self.excluded_poses)
@@ -256,7 +256,7 @@ def _make_entry(registry: Registry[Any], plain: str | Mapping[str, Any]) -> Any:
     _refuse_object(stated)
     name = stated.pop("name", None)
     if not isinstance(name, str):
-        raise DataError(f"{plain!r} names no {registry.noun}; known are {', '.join(registry)}")
+        raise DataError(f"{plain!r} names no {registry.noun}. Known: {', '.join(registry)}")
     make = registry[name]
     allowed = inspect.signature(make).parameters
     for key in stated:
@@ -291,7 +291,7 @@ def check_labels(option: str, labels: Sequence[str]) -> tuple[str, ...]:
     """Return labels of poses as a tuple; raise DataError for a single text."""
     if isinstance(labels, str):
         raise DataError(
-            f"{option} is the text {labels!r}; give a sequence of labels, such as [{labels!r}]"
+            f"{option} is the text {labels!r}. Give a sequence of labels, such as [{labels!r}]"
         )
     given = tuple(labels)
     for label in given:
@@ -303,7 +303,7 @@ def _check_choice(name: str, value: str, allowed: tuple[str, ...]) -> None:
     """Refuse a word that is not allowed."""
     if value not in allowed:
         words = " or ".join(repr(word) for word in allowed)
-        raise EstimationError(f"{name} is {value!r}; it must be {words}")
+        raise EstimationError(f"{name} is {value!r}, but must be {words}")
 
 
 def _is_instance_with(value: object, attributes: Sequence[str]) -> bool:

@@ -269,7 +269,7 @@ class TruncatedSVD(Method):
     def __post_init__(self) -> None:
         if not callable(self.k) and (not isinstance(self.k, int | np.integer) or self.k < 0):
             raise EstimationError(
-                f"truncation at k = {self.k}: k is a number of directions; give an integer >= 0, "
+                f"truncation at k = {self.k}: k is a number of directions. Give an integer >= 0, "
                 "or a rule such as TruncationGCV()"
             )
 
@@ -346,7 +346,7 @@ class Ridge(Method):
         """`lam`, with numbers by name resolved; EstimationError where they are not."""
         if isinstance(self.lam, Mapping):
             raise EstimationError(
-                "ridge with lam by name needs the names of the parameters; call resolve(names), or "
+                "ridge with lam by name needs the names of the parameters. Call resolve(names), or "
                 "give it to identify"
             )
         return self.lam

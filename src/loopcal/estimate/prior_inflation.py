@@ -409,7 +409,7 @@ def add_factor_uncertainty(result: Identification, fit: Descent) -> Identificati
     errors += _estimate_component_errors(fit, method, factor)
     scale = result.tolerance[:, None]
     component_rows = tuple(component.to_row(result.names) for component in method.components)
-    source: dict[str, Any] = {"source": "stated or assumed"} if method.held else {}
+    source: dict[str, Any] = {"source": "given or assumed"} if method.held else {}
     finding = report_finding(INFLATION, factor=factor, parts=component_rows, **source)
     change = np.stack([error[0] for error in errors], axis=1)
     inflated = add_covariance(result, scale * change, np.inf, finding)

@@ -169,7 +169,7 @@ def _check_options(options: FitOptions) -> FitOptions:
         )
     if options.loss is not None or options.prior is not None:
         name = "loss" if options.loss is not None else "prior"
-        raise EstimationError(f"recalibration takes no {name}; remove it from the options")
+        raise EstimationError(f"recalibration takes no {name}. Remove it from the options")
     return options
 
 

@@ -481,7 +481,7 @@ class Identification(TableResult):
         if self.options.prior is not None:
             return report_finding("prior.intervals", source="the earlier calibration")
         if self.method.has_prior and not self.free_parameters.assumed.all():
-            return report_finding("prior.intervals", source="the tolerances")
+            return report_finding("prior.intervals", source="the expected spreads")
         return None
 
     @property

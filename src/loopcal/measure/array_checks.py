@@ -23,18 +23,18 @@ def check_array(
         array = np.array(value, dtype=float)
     except (TypeError, ValueError):
         raise DataError(
-            f"{what}: got {describe(value)}; give an array of numbers of shape ({wanted})"
+            f"{what}: got {describe(value)}. Give an array of numbers of shape ({wanted})"
         ) from None
     if array.ndim != len(shape) or any(
         n is not None and n != m for n, m in zip(shape, array.shape, strict=True)
     ):
-        raise DataError(f"{what} has shape {array.shape}; give an array of shape ({wanted})")
+        raise DataError(f"{what} has shape {array.shape}. Give an array of shape ({wanted})")
     wrong = np.isinf(array) if allow_nan else ~np.isfinite(array)
 
     def describe_entry(*place: int) -> str:
         where = f"row {place[0] + 1}" + (f", column {place[1] + 1}" if len(place) > 1 else "")
-        advice = "give a finite number" + (" or NaN" if allow_nan else "")
-        return f"{what}: {where} is {array[place]}; {advice}"
+        advice = "Give a finite number" + (" or NaN" if allow_nan else "")
+        return f"{what}: {where} is {array[place]}. {advice}"
 
     refuse_first(wrong, describe_entry)
     array.setflags(write=False)
@@ -54,11 +54,11 @@ def broadcast_array(value: ArrayLike, shape: tuple[int, ...], what: str, wanted:
             raise TypeError
         given = np.asarray(value, dtype=float)
     except (TypeError, ValueError):
-        raise DataError(f"{what}: got {describe(value)}; give {wanted}") from None
+        raise DataError(f"{what}: got {describe(value)}. Give {wanted}") from None
     try:
         return np.array(np.broadcast_to(given, shape))
     except ValueError:
-        raise DataError(f"{what} has shape {given.shape}; give {wanted}") from None
+        raise DataError(f"{what} has shape {given.shape}. Give {wanted}") from None
 
 
 def check_pose(value: ArrayLike, what: str) -> FloatArray:
@@ -69,7 +69,7 @@ def check_pose(value: ArrayLike, what: str) -> FloatArray:
     if error > 1e-9 or np.linalg.det(R) < 0.0 or not np.array_equal(T[3], [0.0, 0.0, 0.0, 1.0]):
         raise DataError(
             f"{what} is not a pose: its rotation part deviates by {error:.2g} from a right-handed "
-            "rotation, or its last row is not 0 0 0 1; give R with R R' = 1 to 1e-9 and det R = 1, "
+            "rotation, or its last row is not 0 0 0 1. Give R with R R' = 1 to 1e-9 and det R = 1, "
             "and the translation [m] in the last column"
         )
     return T
@@ -85,7 +85,7 @@ def check_direction(value: ArrayLike, what: str) -> FloatArray:
     vector = check_point(value, what)
     length = float(np.linalg.norm(vector))
     if not length > 0.0:
-        raise DataError(f"{what} is 0, 0, 0; give a vector of any length above 0")
+        raise DataError(f"{what} is 0, 0, 0. Give a vector of any length above 0")
     # a vector of length 1 is kept bit by bit, so that files are written as they were read
     return vector if abs(length - 1.0) < 1e-15 else check_point(vector / length, what)
 
@@ -95,7 +95,7 @@ def check_names(names: str | Iterable[str], what: str) -> tuple[str, ...]:
     given = (names,) if isinstance(names, str) else tuple(names)
     if not given or len(set(given)) < len(given):
         listed = ", ".join(given) or "empty"
-        raise DataError(f"the {what} are {listed}; name at least one, and each once")
+        raise DataError(f"the {what} are {listed}. Name at least one, and each once")
     return given
 
 
@@ -103,13 +103,13 @@ def check_type(value: object, wanted: type, what: str, hint: str) -> None:
     """Raise a DataError that calls an argument `what`, and says how to obtain one of the class."""
     accepted = (float, int) if wanted is float else wanted
     if not isinstance(value, accepted):
-        raise DataError(f"{what}: got {describe(value)}; give {wanted.__name__}, {hint}")
+        raise DataError(f"{what}: got {describe(value)}. Give {wanted.__name__}, {hint}")
 
 
 def check_seed(seed: int) -> None:
     """Raise a DataError for a seed of a random stream below 0."""
     if seed < 0:
-        raise DataError(f"seed is {seed}; give a whole number, 0 or more")
+        raise DataError(f"seed is {seed}. Give a whole number, 0 or more")
 
 
 def describe(value: object) -> str:

@@ -68,8 +68,7 @@ def choose_fitted(
         unit = joined if joined.max() > 0 else unit
     if unit.max() == 0:
         raise DataError(
-            "cannot split measurements of a single block; measure more poses, or state smaller "
-            "blocks"
+            "cannot split measurements of a single block. Measure more poses, or use smaller blocks"
         )
 
     def permute(unit: IntArray) -> IntArray:

@@ -45,7 +45,7 @@ def _check_positive(value: ArrayLike, what: str) -> FloatArray:
     refuse_first(
         ~is_sd(array),
         lambda i: (
-            f"{what} contains {array[i]:.6g}; give a number above 0 for each column, {SD_RANGE}"
+            f"{what} contains {array[i]:.6g}. Give a number above 0 for each column, {SD_RANGE}"
         ),
     )
     return array
@@ -157,7 +157,7 @@ class Sensor:
         if len(self.noise.sigma) != len(self.kind.noise_columns):
             names = ", ".join(column.name for column in self.kind.noise_columns)
             raise DataError(
-                f"the noise of kind {self.kind.name!r} has {len(self.noise.sigma)} numbers; give "
+                f"the noise of kind {self.kind.name!r} has {len(self.noise.sigma)} numbers. Give "
                 f"one for each of {names}"
             )
 
@@ -173,7 +173,7 @@ class Sensor:
         if rows.size and (rows.min() < 0 or rows.max() >= n_poses):
             raise DataError(
                 f"the rows of kind {self.kind.name!r} refer to pose {int(rows.max())}, but the "
-                f"{n_poses} poses are 0 to {n_poses - 1}; correct the rows"
+                f"{n_poses} poses are 0 to {n_poses - 1}. Correct the rows"
             )
         names = {
             name: check_labels(getattr(self, name), len(rows), name)
@@ -190,7 +190,7 @@ class Sensor:
     def assigned_rows(self) -> IntArray:
         """Rows of a sensor from `assign_rows`; DataError where they are still implicit."""
         if self.rows is None:
-            raise DataError("the sensor has no rows yet; use sensor.assign_rows(n_poses)")
+            raise DataError("the sensor has no rows yet. Use sensor.assign_rows(n_poses)")
         return self.rows
 
     def _list_rows(self, n: int) -> IntArray:
@@ -204,7 +204,7 @@ class Sensor:
         if n < 2:
             raise DataError(
                 f"a row of kind {self.kind.name!r} compares two poses, but the number of poses is "
-                f"{n}; give at least 2"
+                f"{n}. Give at least 2"
             )
         first = np.arange(n if n > 2 else 1)
         return np.stack([first, (first + 1) % n], axis=-1)

@@ -40,12 +40,12 @@ def _check_bodies(of_poses: Sequence[Observations], of_base: Sequence[Observatio
     for i, kind in enumerate(kinds):
         if kind.is_of_base and i < len(of_poses):
             raise DataError(
-                f"rows of kind {kind.name!r} measure targets on the base; pass them as "
+                f"rows of kind {kind.name!r} measure targets on the base. Pass them as "
                 "`base_observations`, not as `observations`"
             )
         if i >= len(of_poses) and not kind.is_of_base:
             raise DataError(
-                f"rows of kind {kind.name!r} measure poses; pass them as `observations`, or give "
+                f"rows of kind {kind.name!r} measure poses. Pass them as `observations`, or give "
                 'their kind `of="base"`'
             )
     for kind in kinds:
@@ -135,23 +135,23 @@ class Measurements(TableResult):
             refuse_first(
                 np.isnan(readings),
                 lambda i, j: (
-                    f"readings: row {i + 1}, column {j + 1} is nan; give a finite number, or "
-                    "reading_sigma = inf where it is missing"
+                    f"readings: row {i + 1}, column {j + 1} is nan. Give a finite number, "
+                    f"or reading_sigma = inf if it is missing"
                 ),
             )
         n = len(readings)
         if n == 0:
-            raise DataError("the measurements have no pose; give at least one row of readings")
+            raise DataError("the measurements have no pose. Give at least one row of readings")
         block = np.array(self.block if len(self.block) else np.arange(n))
         if block.shape != (n,) or not np.issubdtype(block.dtype, np.integer):
             raise DataError(
-                f"block has shape {block.shape} and type {block.dtype}; give one whole number for "
+                f"block has shape {block.shape} and type {block.dtype}. Give one whole number for "
                 "each pose"
             )
         block.setflags(write=False)
         labels = tuple(self.labels) or tuple(str(i + 1) for i in range(n))
         if len(labels) != n:
-            raise DataError(f"{len(labels)} labels for {n} poses; give one for each")
+            raise DataError(f"{len(labels)} labels for {n} poses. Give one for each")
         for rows in self.observations:
             check_type(
                 rows, Observations, "observations", "such as loopcal.Observations.from_sigma(...)"
@@ -278,18 +278,18 @@ class Measurements(TableResult):
         is_mask = given.dtype == bool
         if given.size and not is_mask and not np.issubdtype(given.dtype, np.integer):
             raise DataError(
-                f"poses: got an array of type {given.dtype}; give indices, or a mask of booleans"
+                f"poses: got an array of type {given.dtype}. Give indices, or a mask of booleans"
             )
         if is_mask and given.shape != (self.n_poses,):
             raise DataError(
-                f"the mask of poses has shape {given.shape}; give ({self.n_poses},), one for each "
+                f"the mask of poses has shape {given.shape}. Give ({self.n_poses},), one for each "
                 "pose"
             )
         chosen = np.flatnonzero(given) if is_mask else given.astype(np.intp)
         outside = (chosen < 0) | (chosen >= self.n_poses)
         if np.any(outside) or len(find_distinct(chosen)) < len(chosen) or not len(chosen):
             raise DataError(
-                f"cannot take poses {chosen.tolist()}; give at least one of 0 to "
+                f"cannot take poses {chosen.tolist()}. Give at least one of 0 to "
                 f"{self.n_poses - 1}, each once"
             )
         place = np.full(self.n_poses, -1)
@@ -327,7 +327,7 @@ class Measurements(TableResult):
         check_seed(seed)
         if not 0.0 < hold_out < 1.0:
             raise DataError(
-                f"cannot hold out a share of {hold_out}; give the share of the poses that is not "
+                f"cannot hold out a share of {hold_out}. Give the share of the poses that is not "
                 "fitted, above 0 and below 1, such as 0.25"
             )
         fitted = choose_fitted(self, hold_out, seed, regions)
@@ -359,7 +359,7 @@ def _check_held_out(is_held_out: ArrayLike, block: IntArray, labels: tuple[str, 
     mask = given if given.size else np.zeros(len(block), dtype=bool)
     if mask.shape != block.shape:
         raise DataError(
-            f"is_held_out has shape {mask.shape}; give one boolean for each of {len(block)} poses"
+            f"is_held_out has shape {mask.shape}. Give one boolean for each of {len(block)} poses"
         )
     for i in np.flatnonzero(mask & np.isin(block, block[~mask]))[:1]:
         j = np.flatnonzero((block == block[i]) & ~mask)[0]
@@ -376,6 +376,6 @@ def _check_poses(rows: Observations, n: int) -> None:
         (poses < 0) | (poses >= n),
         lambda i, j: (
             f"row {i + 1} of kind {rows.kind.name!r} refers to pose {int(poses[i, j])}, but the "
-            f"{n} poses are 0 to {n - 1}; correct the row, or add the readings of the pose"
+            f"{n} poses are 0 to {n - 1}. Correct the row, or add the readings of the pose"
         ),
     )

@@ -58,14 +58,14 @@ class StatedValue:
 
     def __post_init__(self) -> None:
         if self.scope not in ("session", "all"):
-            raise DataError(f"the scope of {self.name!r} is {self.scope!r}; give session or all")
+            raise DataError(f"the scope of {self.name!r} is {self.scope!r}. Give session or all")
         if self.sd not in (0.0, np.inf) and not is_sd(self.sd):
             raise DataError(
-                f"the standard deviation of {self.name!r} is {self.sd}; give a number above 0, "
+                f"the standard deviation of {self.name!r} is {self.sd}. Give a number above 0, "
                 f"{SD_RANGE}, or 0 to fix the parameter"
             )
         if self.nominal is not None and not np.isfinite(self.nominal):
-            raise DataError(f"the value of {self.name!r} is {self.nominal}; give a finite number")
+            raise DataError(f"the value of {self.name!r} is {self.nominal}. Give a finite number")
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +110,7 @@ class NuisanceParameters:
         """
         if not is_sd(sd):
             raise DataError(
-                f"the standard deviation of {pattern!r} is {sd}; give a number above 0, or fix the "
+                f"the standard deviation of {pattern!r} is {sd}. Give a number above 0, or fix the "
                 f"parameter (allowed: {SD_RANGE})"
             )
         return self._changed(pattern, tolerance=sd)
@@ -230,8 +230,8 @@ def _enter(entries: dict[str, Parameter], parameter: Parameter, owner: str, kind
     if existing != entry:
         raise DataError(
             f"the kind {kind.name!r} states the parameter {name!r} as {entry.nominal:.9g} (scope "
-            f"{entry.scope}), another kind states it as {existing.nominal:.9g} (scope "
-            f"{existing.scope}); state it alike, or use another name"
+            f"{entry.scope}), another kind defines it as {existing.nominal:.9g} (scope "
+            f"{existing.scope}). Give it alike, or use another name"
         )
     return name
 
@@ -243,7 +243,7 @@ def _check_common(kind: Kind, common: Collection[str]) -> None:
             if name in common:
                 raise DataError(
                     f"the scope of {name!r} is all, but only offsets and common errors of an "
-                    "instrument, such as its scale, can be shared by all sessions; leave it out"
+                    "instrument, such as its scale, can be shared by all sessions. Leave it out"
                 )
 
 
@@ -253,12 +253,12 @@ def _check_names(kind: Kind, references: dict[str, FloatArray]) -> None:
     repeated = next((name for name in names if names.count(name) > 1), None)
     if repeated is not None:
         raise DataError(
-            f"the kind {kind.name!r} has two parameters called {repeated!r}; give frames, targets "
+            f"the kind {kind.name!r} has two parameters called {repeated!r}. Give frames, targets "
             "and surfaces different names"
         )
     for name, value in kind.references.items():
         if not np.array_equal(references.setdefault(name, value), value):
             raise DataError(
                 f"the kind {kind.name!r} states another orientation or place of {name!r} than the "
-                "kind before; state them alike, or use another name"
+                "kind before. Give them alike, or use another name"
             )

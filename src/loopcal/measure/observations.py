@@ -113,7 +113,7 @@ def _refuse(wrong: BoolArray, what: str) -> None:
     refuse_first(
         wrong,
         lambda i: (
-            f"the covariance of row {i + 1} {what}; give each component a standard deviation above "
+            f"the covariance of row {i + 1} {what}. Give each component a standard deviation above "
             "0 and correlations between -1 and 1 that are consistent"
         ),
     )
@@ -159,10 +159,10 @@ class InstrumentRecord:
         for key in DATES:
             text = getattr(self, key)
             if text and not is_date(text):
-                raise DataError(f"{key} is {text!r}; write a date as 2026-05-31")
+                raise DataError(f"{key} is {text!r}. Write a date as 2026-05-31")
         if self.due and self.calibrated and self.due < self.calibrated:
             raise DataError(
-                f"due is {self.due}, which is before calibrated, {self.calibrated}; correct one"
+                f"due is {self.due}, which is before calibrated, {self.calibrated}. Correct one"
             )
 
     def __str__(self) -> str:
@@ -267,7 +267,7 @@ class Observations:
         kind = self.kind
         check_type(kind, Kind, "kind", "such as loopcal.Pose()")
         if not kind.has_tool:
-            raise DataError(f"the kind {kind.name!r} has no tool; use kind.with_tool(robot.tool)")
+            raise DataError(f"the kind {kind.name!r} has no tool. Use kind.with_tool(robot.tool)")
         rows = check_rows(self.rows, kind)
         rows = np.zeros_like(rows) if kind.is_of_base else rows
         m, r = len(kind.noise_columns), len(rows)
@@ -278,7 +278,7 @@ class Observations:
         refuse_first(
             weight < 0.0,
             lambda i: (
-                f"the weight of row {i + 1} is {weight[i]:.6g}; give a positive number, or 0 to "
+                f"the weight of row {i + 1} is {weight[i]:.6g}. Give a positive number, or 0 to "
                 "exclude the row"
             ),
         )
@@ -329,7 +329,7 @@ class Observations:
         sd = broadcast_array(sigma, shape, "sigma", f"one number, or one for each of {names}")
         wrong = sd[~(is_sd(sd) | np.isnan(sd) | (sd == 0.0))]
         if len(wrong):
-            raise DataError(f"sigma contains {wrong[0]:.6g}; give numbers above 0, {SD_RANGE}")
+            raise DataError(f"sigma contains {wrong[0]:.6g}. Give numbers above 0, {SD_RANGE}")
         N = kind.linearize_noise(values)
         covariance = (N * (sd * sd)[:, None, :]) @ np.swapaxes(N, -1, -2)
         of_session, of_group = np.asarray(session), np.asarray(group)
@@ -431,15 +431,15 @@ def check_rows(rows: ArrayLike, kind: Kind) -> IntArray:
     if given.ndim != wanted or (wanted == 2 and given.shape[1] != kind.poses_per_row) or not whole:
         shape = "(r,)" if wanted == 1 else f"(r, {kind.poses_per_row})"
         raise DataError(
-            f"rows of kind {kind.name!r} have shape {given.shape} and type {given.dtype}; give "
+            f"rows of kind {kind.name!r} have shape {given.shape} and type {given.dtype}. Give "
             f"whole numbers of shape {shape}: the index of the pose of each row"
         )
     if wanted == 2:
         refuse_first(
             given[:, 0] == given[:, 1],
             lambda i: (
-                f"row {i + 1} of kind {kind.name!r} compares pose {int(given[i, 0])} with itself; "
-                "give two different poses"
+                f"row {i + 1} of kind {kind.name!r} compares pose {int(given[i, 0])} with itself. "
+                "Give two different poses"
             ),
         )
     return given.astype(np.intp)
@@ -450,7 +450,7 @@ def check_labels(value: ArrayLike, r: int, what: str) -> TextArray:
     given = np.asarray(value)
     if given.dtype.kind != "U" or given.shape not in ((), (r,)):
         raise DataError(
-            f"the {what} has shape {given.shape} and type {given.dtype}; give one text, or one for "
+            f"the {what} has shape {given.shape} and type {given.dtype}. Give one text, or one for "
             f"each of {r} rows"
         )
     labels = np.array(np.broadcast_to(given, (r,)))

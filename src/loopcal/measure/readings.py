@@ -42,14 +42,14 @@ def solve_commanded_poses(
     """
     solution = inverse(controller, commanded)
     if labels and len(labels) != len(solution):
-        raise DataError(f"{len(labels)} names are given for {len(solution)} poses; name each pose")
+        raise DataError(f"{len(labels)} names are given for {len(solution)} poses. Name each pose")
     failed = np.flatnonzero(~solution.converged)
     if len(failed):
         first = int(failed[0])
         name = name_pose(first, labels, places)
         raise DataError(
             f"{controller.name!r} does not reach commanded pose {name} ({len(failed)} of "
-            f"{len(solution.q)} fail): {solution.explain(first)}; correct the pose, or the "
+            f"{len(solution.q)} fail): {solution.explain(first)}. Correct the pose, or the "
             "geometry of the controller"
         )
     return solution
@@ -145,10 +145,10 @@ def broadcast_reading_sigma(sigma: ArrayLike, readings: FloatArray) -> FloatArra
 
 def _refuse_wrong_sigma(sigma: FloatArray, name: Callable[[int, int], str]) -> None:
     """Raise DataError for a sigma (n, a) that is none; `name` it by pose and actuator."""
-    act = f"give 0 (exact), a positive number from {SMALLEST_SD:g} on, or infinity (missing)"
+    act = f"Give 0 (exact), a positive number from {SMALLEST_SD:g} on, or infinity (missing)"
     refuse_first(
         ~((sigma == 0.0) | (sigma >= SMALLEST_SD)),
-        lambda i, j: f"{name(i, j)} is not a standard deviation; {act}",
+        lambda i, j: f"{name(i, j)} is not a standard deviation. {act}",
     )
 
 
@@ -167,7 +167,7 @@ def check_reading_sigma(
     _refuse_wrong_sigma(checked, name)
     refuse_first(
         np.isnan(readings) & np.isfinite(checked),
-        lambda i, j: f"{name(i, j)} belongs to a missing reading; give the reading, or infinity",
+        lambda i, j: f"{name(i, j)} belongs to a missing reading. Give the reading, or infinity",
     )
     checked.setflags(write=False)
     return checked
@@ -198,16 +198,16 @@ def resolve_reading_sigma(robot: Mechanism, given: FloatArray | None, n: int) ->
     refuse_first(
         np.isfinite(given) & (given / size > LARGEST_SIGMA),
         lambda i, j: (
-            f"{name(i, j)} is larger than any possible error of a reading; give inf (missing) "
+            f"{name(i, j)} is larger than any possible error of a reading. Give inf (missing) "
             "instead"
         ),
     )
     if robot.program.sigma is not None and np.any(given == 0.0):
         exact = robot.actuators[int(np.argwhere(given == 0.0)[0, 1])].name
         raise DataError(
-            f"the readings of {exact} are stated to be exact, but {robot.name!r} has "
+            f"the readings of {exact} are declared exact, but {robot.name!r} has "
             f"{len(robot.actuators)} actuators for {len(robot.freedoms)} degrees of freedom; "
-            "readings of redundant actuators cannot be exact: state a sigma above 0 for each, a "
+            "readings of redundant actuators cannot be exact. Give each a sigma above 0, a "
             "small one for very good encoders"
         )
     return given if np.any(given != 0.0) else None

@@ -195,7 +195,7 @@ def sample_truth(
     check_type(robot, Mechanism, "robot", "from loopcal.load_robot")
     refuse_drawn_errors(robot)
     if distribution not in get_args(Distribution):
-        raise DataError(f"distribution is {distribution!r}; give 'normal' or 'uniform'")
+        raise DataError(f"distribution is {distribution!r}. Give 'normal' or 'uniform'")
     table = robot.parameters
     own = np.array([entry.tolerance or 0.0 for entry in table.entries])
     effects = np.column_stack([np.diag(own), table.common_effects]) * table.free[:, None]
@@ -250,7 +250,7 @@ def simulate_trials(
     check_kinds(robot, kinds)
     values = check_array(np.atleast_2d(np.asarray(truth)), "truth", (None, len(robot.parameters)))
     if not len(values):
-        raise DataError("truth has no row; give the parameter values of at least one machine")
+        raise DataError("truth has no row. Give the parameter values of at least one machine")
     geometry = robot.nominal if controller is None else controller
     commanded = solve_commanded_poses(geometry, poses, *pose_names)
     readings, n = _draw_conditions(robot, commanded.q, seed), len(commanded.q)
@@ -351,7 +351,7 @@ def simulate(
         name = name_pose(int(failed[0]), *pose_names)
         raise DataError(
             f"the true machine does not reach pose {name} with the readings of the controller "
-            f"({len(failed)} of {len(trials.readings)} poses fail); choose poses further inside "
+            f"({len(failed)} of {len(trials.readings)} poses fail). Choose poses further inside "
             "the workspace, or smaller errors"
         )
     return trials.trial(0)
@@ -371,7 +371,7 @@ def replace_measured_values(
         first = int(failed[0])
         raise DataError(
             f"{robot.name} does not reach pose {data.labels[first]!r} with its readings "
-            f"({nominal.explain(first)}); correct the readings"
+            f"({nominal.explain(first)}). Correct the readings"
         )
     sensors = tuple(
         replace(sensor, rows=rows.rows, session=rows.session, group=rows.group)
@@ -421,13 +421,13 @@ def simulate_contacts(
     other = [o.kind.name for o in sheet.observations if not isinstance(o.kind, Plane | Line)]
     if other:
         raise DataError(
-            f"rows of the kind {other[0]!r} state no readings; only points on planes and lines are "
+            f"rows of the kind {other[0]!r} have no readings; only points on planes and lines are "
             "simulated without readings"
         )
     missing = [name for name in POSITION if name not in robot.controlled]
     if missing:
         raise DataError(
-            f"{robot.name} does not control {', '.join(missing)}, so that its points cannot be "
+            f"{robot.name} does not control {', '.join(missing)}, so its points cannot be "
             "moved to planes and lines"
         )
     filled = tuple(
@@ -458,7 +458,7 @@ def simulate_contacts(
         q, T = _command(robot, commanded, sheet)
     raise DataError(
         f"{robot.name} does not bring all points to their surfaces: a gap of {largest:.3g} m is "
-        f"left after {STEPS} corrections; simulate smaller errors"
+        f"left after {STEPS} corrections. Simulate smaller errors"
     )
 
 
@@ -474,7 +474,7 @@ def _command(
         solution = true if controller.converged[first] else controller
         raise DataError(
             f"{robot.name} does not reach pose {sheet.labels[first]!r} "
-            f"({solution.explain(first)}); simulate smaller errors, or plan the points closer to "
+            f"({solution.explain(first)}). Simulate smaller errors, or plan the points closer to "
             "the middle of the workspace"
         )
     return controller.q, true.T

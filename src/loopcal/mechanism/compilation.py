@@ -147,7 +147,7 @@ def _close_at_home(
         if not abs(p.nominal) <= LARGEST:
             symbol = SI_SYMBOLS[p.dimension]
             raise MechanismError(
-                f"the nominal value of {p.name} is {p.nominal:g} {symbol}; it must not be beyond "
+                f"the nominal value of {p.name} is {p.nominal:g} {symbol}, above the limit of "
                 f"{LARGEST:g} {symbol}"
             )
     slots = _find_slots(assembly)
@@ -243,8 +243,8 @@ def _find_slots(assembly: Assembly) -> dict[str, dict[Address, Slot]]:
             slots[address.owner][address] = slot
     if unknown:
         raise MechanismError(
-            f"a parameter is mapped onto {min(unknown)}, which this mechanism does not have; "
-            "correct the map"
+            f"a parameter is mapped onto {min(unknown)}, which this mechanism does not have. "
+            "Correct the map"
         )
     return slots
 
@@ -276,7 +276,7 @@ def _check_drives(assembly: Assembly, idle: Mapping[int, tuple[int, ...]]) -> No
             excess = name_count(joints - equations, "joint")
             raise MechanismError(
                 f"limb {limb.name!r} has {joints} joints, but {equations} closure equations: its "
-                f"drive moves the limb and not the platform; leave out {excess}, "
+                f"drive moves the limb and not the platform. Leave out {excess}, "
                 "or let their axes spin the limb only"
             )
 
@@ -354,7 +354,7 @@ def _weigh_actuators(
     sigma = [a.sigma if a.sigma is not None else 1.0 for a in assembly.rows]
     if len({a.sigma is None for a in assembly.rows}) > 1 or min(sigma) <= 0:
         raise MechanismError(
-            f"{assembly.name} has more actuators than freedoms; state a positive sigma for every "
+            f"{assembly.name} has more actuators than freedoms. Give a positive sigma for every "
             "actuator, or for none"
         )
     return tuple(s / max(sigma) for s in sigma)
@@ -376,13 +376,13 @@ def _check_sums(assembly: Assembly, freedoms: tuple[int, ...]) -> None:
         return
     if a > m:
         raise MechanismError(
-            f"{assembly.name} has {a} readings for {m} freedoms, and some of them are sums; leave "
+            f"{assembly.name} has {a} readings for {m} freedoms, and some of them are sums. Leave "
             "out readings, because redundant readings cannot be sums"
         )
     if a < m and a != joints:
         raise MechanismError(
             f"{assembly.name} has {a} readings of {joints} driven joints for {m} freedoms, so its "
-            "sums do not hold the platform; state one reading for every freedom"
+            "sums do not hold the platform. Give one reading for every freedom"
         )
 
 
@@ -428,8 +428,9 @@ def _find_home(robot: Mechanism) -> State:
     if len(robot.controlled) < movable:
         raise MechanismError(
             f"{robot.name} can be moved in {movable} freedoms or more, but names only "
-            f"{len(robot.controlled)} controlled coordinates ({', '.join(robot.controlled)}); name "
-            "one for every freedom, or state fewer `freedoms:`"
+            f"{len(robot.controlled)} controlled coordinates "
+            f"({', '.join(robot.controlled)}). Name one for every freedom, or list fewer "
+            f"`freedoms:`"
         )
     target = read_coordinates(robot.assembly.home[None, None], robot.controlled)
     state = inverse_trials(robot, values, target)
@@ -437,8 +438,8 @@ def _find_home(robot: Mechanism) -> State:
         if robot.assembly.couplings and movable < len(robot.controlled):
             raise MechanismError(
                 f"{robot.name} has {len(robot.assembly.couplings)} couplings, which leave it "
-                f"{max(movable, 0)} freedoms for {len(robot.controlled)} controlled coordinates; "
-                "leave out couplings"
+                f"{max(movable, 0)} freedoms for {len(robot.controlled)} controlled coordinates. "
+                "Leave out couplings"
             )
         refuse_free_bodies(robot, robot.home_state)
         _refuse_singular_start(robot, target)
@@ -447,7 +448,7 @@ def _find_home(robot: Mechanism) -> State:
         refuse_singular_home(robot, state)
         raise MechanismError(
             f"the loops of {robot.name} cannot be closed at its home pose: "
-            f"{state.residual[0, 0] * 1e3:.3g} mm stay open; check the joint centers, the lengths "
+            f"{state.residual[0, 0] * 1e3:.3g} mm stay open. Check the joint centers, the lengths "
             "and `home:`"
         )
     if shared:
@@ -580,7 +581,7 @@ def _check_chain(robot: Mechanism, home: State) -> None:
     for held in robot.assembly.held:
         if held not in names:
             hint = suggest_names(held, names)
-            raise MechanismError(f"`held:` names {held!r}, which is no actuator{hint}")
+            raise MechanismError(f"`held:` names {held!r}, which is not an actuator{hint}")
     moving = find_carrying_actuators(robot)
     values = robot.values[None]
     _, tau = robot.slots(values)

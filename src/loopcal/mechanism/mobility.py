@@ -114,7 +114,7 @@ def check_mobility(robot: Mechanism) -> None:
     if len(robot.controlled) != movable:
         raise MechanismError(
             f"{robot.name} can be moved in {movable} freedoms, but names "
-            f"{len(robot.controlled)} controlled coordinates ({', '.join(robot.controlled)}); name "
+            f"{len(robot.controlled)} controlled coordinates ({', '.join(robot.controlled)}). Name "
             f"{movable}"
         )
     # freedoms per actuated joint (m, a), or motion, and the controlled coordinates by them
@@ -165,15 +165,15 @@ def _check_open_sums(robot: Mechanism, blocks: engine.ClosureBlocks) -> None:
     unknown, sums = rows.shape[1], len(robot.assembly.rows)
     if count_rank(np.linalg.svd(rows, compute_uv=False)) < unknown:
         raise MechanismError(
-            f"{robot.name}: the sums of its readings and couplings do not hold the platform at "
-            "home, where it can move while all sums are constant; correct the weights of `sum:`, "
-            "or state another `home:`"
+            f"{robot.name}: the sums of its readings and couplings do not hold the platform "
+            f"at home: it can move while all sums are constant. Correct the weights of "
+            f"`sum:`, or give another `home:`"
         )
     free = unknown - count_rank(np.linalg.svd(rows[:closure], compute_uv=False))
     if sums > free:
         raise MechanismError(
             f"{robot.name} has {sums} readings and couplings, but only {free} freedoms without "
-            f"them; leave out {sums - free}, because redundant ones cannot be sums"
+            f"them. Leave out {sums - free}, because redundant ones cannot be sums"
         )
 
 
@@ -224,7 +224,7 @@ def _word_dependent(robot: Mechanism, count: int) -> str:
     """Return the sentence for controlled coordinates that depend on each other."""
     return (
         f"{robot.name}: the coordinates {', '.join(robot.controlled)} cannot be set independently "
-        f"at home; name {count} that the actuators move independently, of {', '.join(COORDINATES)}"
+        f"at home. Name {count} that the actuators move independently, of {', '.join(COORDINATES)}"
     )
 
 
@@ -306,19 +306,19 @@ def _check_names(assembly: Assembly) -> None:
     for kind, names in (("limb", limbs), ("actuator", actuators), ("coupling", rows)):
         for name in names:
             if names.count(name) > 1:
-                raise MechanismError(f"two {kind}s are called {name!r}; give each its own name")
+                raise MechanismError(f"two {kind}s are called {name!r}. Give each its own name")
     driven = [name for limb in assembly.limbs for name in limb.drives]
     read = assembly.driven_joints
     for name in read:
         if name not in driven:
             raise MechanismError(
-                f"actuator {name!r} drives 0 joints; let it drive one joint, or one in each of "
+                f"actuator {name!r} drives 0 joints. Let it drive one joint, or one in each of "
                 "several limbs"
             )
     unknown = sorted(set(driven) - set(read))
     if unknown:
         raise MechanismError(
-            f"a joint is driven by {unknown[0]!r}, which is not among the actuators; add it or "
+            f"a joint is driven by {unknown[0]!r}, which is not among the actuators. Add it or "
             "correct the name"
         )
 
@@ -328,7 +328,7 @@ def _check_limb(limb: Limb) -> None:
     joints = [joint.name for joint in limb.joints]
     if len(set(joints)) < len(joints):
         raise MechanismError(
-            f"two joints of limb {limb.name!r} have the same name ({', '.join(joints)}); give each "
+            f"two joints of limb {limb.name!r} share one name ({', '.join(joints)}). Give each "
             "its own name"
         )
     if len(set(limb.drives)) < len(limb.drives):
@@ -342,7 +342,7 @@ def _check_limb(limb: Limb) -> None:
         )
     if len(limb.links) != len(limb.joints) + 1:
         raise MechanismError(
-            f"limb {limb.name!r} has {len(limb.joints)} joints and {len(limb.links)} links; give "
+            f"limb {limb.name!r} has {len(limb.joints)} joints and {len(limb.links)} links. Give "
             "one link more than joints"
         )
 
@@ -353,29 +353,29 @@ def _check_freedoms(assembly: Assembly, is_stage: bool) -> None:
     unknown = [f for f in freedoms if f not in AXES]
     if unknown:
         raise MechanismError(
-            f"{unknown[0]!r} is not a freedom of a platform; allowed are {', '.join(AXES)}"
+            f"{unknown[0]!r} is not a freedom of a platform. Allowed: {', '.join(AXES)}"
         )
     if not freedoms:
         raise MechanismError(
-            f"{assembly.name} has no freedoms; state those of its platform, of {', '.join(AXES)}"
+            f"{assembly.name} has no freedoms. Give those of its platform, of {', '.join(AXES)}"
         )
     duplicates = [f for f in freedoms if freedoms.count(f) > 1]
     if duplicates:
         raise MechanismError(
-            f"duplicate freedom {duplicates[0]!r} in {', '.join(freedoms)}; name each once"
+            f"duplicate freedom {duplicates[0]!r} in {', '.join(freedoms)}. Name each once"
         )
     balls = [limb.name for limb in assembly.limbs if not select_rows(limb.ending, freedoms)]
     if balls:
         raise MechanismError(
             f"limb {balls[0]!r} ends in a ball, whose closure equations are shifts, but the "
-            f"freedoms of the platform are {', '.join(freedoms)}; state the shifts of its origin, "
+            f"freedoms of the platform are {', '.join(freedoms)}. Give the shifts of its origin, "
             "too, or leave out `freedoms:`"
         )
     rotations = [f for f in freedoms if f.startswith("r")]
     if len(rotations) == 2:
         raise MechanismError(
-            f"{assembly.name} has the freedoms {' and '.join(rotations)}, which define no pose: "
-            "the same two rotations in another order lead to another one. Let the platform have "
+            f"{assembly.name} has the freedoms {' and '.join(rotations)}, which define no "
+            f"pose: the order of the two rotations is open. Let the platform have "
             "all freedoms, and add a limb with the joint that holds it, such as {joint: U, axes: "
             "[x, y]} with the ending rigid"
         )
@@ -383,7 +383,7 @@ def _check_freedoms(assembly: Assembly, is_stage: bool) -> None:
         return
     if not assembly.controlled:
         raise MechanismError(
-            f"{assembly.name} names no controlled coordinate; state one for each freedom, of "
+            f"{assembly.name} names no controlled coordinate. Give one for each freedom, of "
             f"{', '.join(COORDINATES)}"
         )
     check_coordinates(assembly.controlled)

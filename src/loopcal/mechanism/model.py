@@ -444,10 +444,10 @@ class Mechanism(DrawnResult):
         if new.shape != (len(self.parameters),):
             raise MechanismError(
                 f"{self.name} has {len(self.parameters)} parameters, but values of shape "
-                f"{new.shape} were given; give one value for each"
+                f"{new.shape} were given. Give one value for each"
             )
         if not np.isfinite(new).all():
             bad = self.parameters.names[int(np.argmin(np.isfinite(new)))]
-            raise MechanismError(f"the value of {bad} is not finite; give a number")
+            raise MechanismError(f"the value of {bad} is not finite. Give a number")
         new.setflags(write=False)
         return replace(self, values=new)

@@ -111,7 +111,7 @@ def find_assembly_modes(
     if len(readings) != len(robot.actuators):
         raise DataError(
             f"{len(readings)} readings were given, but {robot.name} has {len(robot.actuators)} "
-            "actuators; give one reading for each"
+            "actuators. Give one reading for each"
         )
     values = robot.values[None]
 
@@ -150,8 +150,8 @@ def find_working_modes(
         )
     if has_spare_drives(robot):
         raise DataError(
-            f"{robot.name} has more drives than coordinates, so that the readings of a pose are "
-            "not countable; name drives to keep at their readings under 'held:'"
+            f"{robot.name} has more drives than coordinates, so the readings of a pose are "
+            "not countable. Name drives to keep at their readings under 'held:'"
         )
     values = robot.values[None]
     begun = inverse_trials(robot, values, wanted[None, None])

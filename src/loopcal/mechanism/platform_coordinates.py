@@ -38,18 +38,18 @@ def check_coordinates(names: tuple[str, ...]) -> None:
     wrong = [n for n in names if n not in COORDINATES]
     if wrong:
         raise MechanismError(
-            f"{wrong[0]!r} is not a platform coordinate; allowed are {', '.join(COORDINATES)}"
+            f"{wrong[0]!r} is not a platform coordinate. Allowed: {', '.join(COORDINATES)}"
         )
     if len(set(names)) < len(names):
-        raise MechanismError(f"duplicate coordinate in {', '.join(names)}; name each once")
+        raise MechanismError(f"duplicate coordinate in {', '.join(names)}. Name each once")
     if set(names) & set(TILT) and set(names) & set(EULER):
         raise MechanismError(
-            f"{', '.join(names)} mixes roll-pitch-yaw with phi-theta-psi; describe the orientation "
+            f"{', '.join(names)} mixes roll-pitch-yaw with phi-theta-psi. Describe the orientation "
             "by one of the two"
         )
     if ("phi" in names) != ("theta" in names):
         raise MechanismError(
-            "phi and theta give the direction of the normal together; name both or neither"
+            "phi and theta give the direction of the normal together. Name both or neither"
         )
 
 

@@ -191,7 +191,7 @@ def trace_singularity(
     DataError : both or neither are given.
     """
     if (readings is None) == (coordinates is None):
-        raise DataError("give a path by its readings or by its coordinates, not both or neither")
+        raise DataError("give a path by exactly one of readings and coordinates")
     solve, points = (forward, readings) if coordinates is None else (inverse, coordinates)
     steps: list[Solution] = []
     last: Solution | None = None

@@ -506,7 +506,7 @@ def forward(robot: Mechanism, q: ArrayLike, start: Solution | None = None) -> So
     if readings.ndim != 2 or readings.shape[1] not in (a, 2 * a):
         raise DataError(
             f"{readings.shape[-1]} readings a row were given, but {robot.name} has {a} actuators "
-            f"({', '.join(actuator.name for actuator in robot.actuators)}); give one reading for "
+            f"({', '.join(actuator.name for actuator in robot.actuators)}). Give one reading for "
             "each"
         )
     state = forward_trials(
@@ -553,7 +553,7 @@ def inverse(robot: Mechanism, target: ArrayLike, start: Solution | None = None) 
         coordinates = np.atleast_2d(wanted)
         state = solve_in_mode(robot, partial(reach_coordinates, robot), coordinates, begin)
     else:
-        raise DataError(f"a target of shape {wanted.shape} was given; allowed are {shapes}")
+        raise DataError(f"a target of shape {wanted.shape} was given. Allowed: {shapes}")
     return make_solution(robot, state, compute_readings(robot, values, state)[0])
 
 
@@ -690,7 +690,7 @@ def _check_poses(T: FloatArray) -> None:
             else "its upper left 3 x 3 is not a rotation (R'R = I, det +1)"
         )
         raise DataError(
-            f"target {row} is not a valid pose: {reason}; give T_base_platform as (n, 4, 4) "
+            f"target {row} is not a valid pose: {reason}. Give T_base_platform as (n, 4, 4) "
             "homogeneous matrices"
         )
 

@@ -301,14 +301,14 @@ def nominal_terms(actuators: Sequence[Actuator]) -> FloatArray:
         wrong = sorted(set(actuator.terms) - {*ALL_TERMS, *table})
         if wrong:
             raise MechanismError(
-                f"actuator {actuator.name!r} has an unknown term {wrong[0]!r}; allowed are "
+                f"actuator {actuator.name!r} has an unknown term {wrong[0]!r}. Allowed: "
                 f"{', '.join(TERMS)}"
             )
         is_plain = actuator.column is None and not actuator.points
         if actuator.terms.get("gain", 1.0) == 0.0 and is_plain:
             raise MechanismError(
-                f"actuator {actuator.name!r} has a gain of 0, so its reading moves nothing; "
-                "state a gain other than 0"
+                f"actuator {actuator.name!r} has a gain of 0, so its reading moves nothing. "
+                "Give a gain other than 0"
             )
     terms, rows = name_terms(actuators), []
     for a in actuators:

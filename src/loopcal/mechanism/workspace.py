@@ -155,7 +155,7 @@ def sample_workspace(
         nothing of its workspace can be reached.
     """
     if n < 1:
-        raise MechanismError(f"{n} positions to draw; give 1 or more")
+        raise MechanismError(f"{n} positions to draw. Give 1 or more")
     rng = np.random.default_rng(seed)
     wanted = workspace_ranges(robot)
     rejected: Counter[str] = Counter()
@@ -171,7 +171,7 @@ def sample_workspace(
             raise MechanismError(
                 f"{robot.name} reaches almost nothing of its workspace: {kept} of {tried} random "
                 f"positions (at least {MIN_REACHABLE_SHARE:.0%} are needed); most frequent reason: "
-                f"{reason} ({count} positions); correct `workspace:`, the strokes or the limits"
+                f"{reason} ({count} positions). Correct `workspace:`, the strokes or the limits"
             )
     drawn, solutions = zip(*batches, strict=True)
     coordinates = np.concatenate(drawn)[:n]
@@ -246,8 +246,8 @@ def list_tilt_rings(robot: Mechanism, n: int) -> FloatArray:
     if not find_reachable(robot, coordinates, rejected)[0].all():
         reason, count = rejected.most_common(1)[0]
         raise MechanismError(
-            f"{robot.name} does not reach {count} of {n} poses on rings of equal tilt ({reason}); "
-            "reduce `workspace:`, or draw poses at random"
+            f"{robot.name} does not reach {count} of {n} poses on rings of equal tilt ({reason}). "
+            "Reduce `workspace:`, or draw poses at random"
         )
     return coordinates
 
@@ -267,7 +267,7 @@ def workspace_ranges(robot: Mechanism) -> dict[str, tuple[float, float]]:
     missing = [name for name in robot.controlled if name not in stated]
     if missing:
         raise MechanismError(
-            f"{robot.name} states no workspace for {', '.join(missing)}; add `workspace:` with a "
+            f"{robot.name} has no workspace for {', '.join(missing)}. Add `workspace:` with a "
             f"range for each of {', '.join(robot.controlled)} to its file"
         )
     return {name: stated[name] for name in robot.controlled}

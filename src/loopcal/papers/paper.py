@@ -93,7 +93,7 @@ class Paper:
         if epsilon is not None and not (self.is_per_leg and 0.0 < epsilon < math.inf):
             able = ", ".join(paper.name for paper in PAPERS.values() if paper.is_per_leg)
             raise DataError(
-                f"epsilon is {epsilon:g} for {self.name}; give a finite number above 0, for {able} "
+                f"epsilon is {epsilon:g} for {self.name}. Give a finite number above 0, for {able} "
                 "only"
             )
         if robot is None or str(robot) in self.robots:
@@ -219,7 +219,7 @@ def _say_levels(names: Sequence[str]) -> str:
 def describe_errors(robot: Mechanism, level: ErrorsLevel) -> str:
     """Return the standard deviations of the errors of a level, such as `0.1 to 1 mm`."""
     if level.deviations:
-        return "those of one machine"
+        return "one machine"
     free = select_free_parameters(robot)
     factor, symbols = free.display()
     sd = free.tolerance * level.tolerance_factor * level.error_factor / factor
@@ -265,7 +265,7 @@ def find_paper(name: str) -> Paper:
     """Return a paper by its name; DataError where no paper is called so."""
     if name not in PAPERS:
         raise DataError(
-            f"{name!r} is not a paper that can be repeated{suggest_names(name, PAPERS)}; known are "
+            f"{name!r} is not a paper that can be repeated{suggest_names(name, PAPERS)}. Known: "
             f"{', '.join(PAPERS)}"
         )
     return PAPERS[name]

@@ -79,7 +79,7 @@ class Reproduction:
             (c.title, c.within.size, int(c.within.sum()), float((abs(c.difference) / c.step).max()))
             for c in self.content.comparisons
         )
-        return Table("summary", "Published beside computed", columns, rows, ("", "d", "d", ".2g"))
+        return Table("summary", "Published and computed", columns, rows, ("", "d", "d", ".2g"))
 
     def to_dict(self) -> dict[str, Any]:
         """Return all content by name, for JSON."""

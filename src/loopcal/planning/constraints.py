@@ -71,12 +71,12 @@ class LineOfSight(PlanSettings):
             object.__setattr__(self, name, given)
         if not np.linalg.norm(self.facing) > 0.0:
             raise DataError(
-                "facing of the line of sight is 0, 0, 0; give a direction with a length above 0"
+                "facing of the line of sight is 0, 0, 0. Give a direction with a length above 0"
             )
         if not 0.0 <= self.nearest < self.farthest:
             raise DataError(
-                f"the line of sight allows distances from {self.nearest:g} to {self.farthest:g} m; "
-                "give a smaller and a larger distance, 0 or more"
+                f"the line of sight allows distances from {self.nearest:g} to {self.farthest:g} m. "
+                "Give a smaller and a larger distance, 0 or more"
             )
 
     def find_violations(
@@ -308,7 +308,7 @@ class PlanOptions(PlanSettings):
         super().__post_init__()
         if self.n_poses is not None and self.goal is not None:
             raise DataError(
-                f"both a number of poses ({self.n_poses}) and an accuracy goal are given; give one "
+                f"both a number of poses ({self.n_poses}) and an accuracy goal are given. Give one "
                 "of them"
             )
         if self.allowed_poses is not None:

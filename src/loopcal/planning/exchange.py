@@ -593,7 +593,7 @@ def coordinate_exchange(
     excluded = np.flatnonzero(~is_allowed(rows))
     if len(excluded):
         raise EstimationError(
-            f"group {excluded[0]} of the first design is not allowed; start from groups that are"
+            f"group {excluded[0]} of the first design is not allowed. Start from groups that are"
         )
     random, moved = np.random.default_rng(0), np.tile(design, (PROBES, 1))
     for c, values in enumerate(levels):

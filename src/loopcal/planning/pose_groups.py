@@ -323,7 +323,7 @@ def count_poses_per_group(instrument: Instrument) -> int:
     links = sorted({sensor.kind.poses_per_row for sensor in instrument.sensors} - {1})
     if len(links) > 1:
         raise DataError(
-            f"kinds that compare {links[0]} and {links[1]} poses cannot be planned together; plan "
+            f"kinds that compare {links[0]} and {links[1]} poses cannot be planned together. Plan "
             "one of them"
         )
     return links[0] if links else 1

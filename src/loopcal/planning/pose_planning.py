@@ -369,7 +369,7 @@ def _plan_number(problem: PlanningProblem, n_poses: int, progress: Progress) -> 
             multiples = (
                 f", in multiples of {k} because the instrument compares {k} poses" if k > 1 else ""
             )
-            raise EstimationError(f"{number} poses {use}; give {least} or more{multiples}")
+            raise EstimationError(f"{number} poses {use}. Give {least} or more{multiples}")
     n = n_poses // k
     problem.require_equations(n)
     rng = np.random.default_rng(np.random.SeedSequence(options.seed, spawn_key=(1,)))

@@ -359,18 +359,18 @@ def _require_plain_sensors(instrument: Instrument) -> None:
     """
     if all(sensor.kind.is_of_base for sensor in instrument.sensors):
         raise DataError(
-            "the instrument only measures targets on the base, which no choice of poses changes; "
-            "add what it measures of the platform"
+            "the instrument only measures targets on the base, which no choice of poses changes. "
+            "Add what it measures of the platform"
         )
     if any(sensor.rows is not None for sensor in instrument.sensors):
         raise DataError(
-            "an instrument for planning measures every pose; leave out the rows of its sensors"
+            "an instrument for planning measures every pose. Leave out the rows of its sensors"
         )
     if any(
         set(np.unique(label)) != {""} for s in instrument.sensors for label in (s.session, s.group)
     ):
         raise DataError(
-            "an instrument for planning is set up once; leave out sessions and groups of its "
+            "an instrument for planning is set up once. Leave out sessions and groups of its "
             "sensors"
         )
 
@@ -496,7 +496,7 @@ def find_sample_size(
     assert goal is not None, "the caller has a goal"
     if not goal > 0.0 or not np.isfinite(goal):
         raise EstimationError(
-            f"the accuracy goal is {robot.to_quantity(goal, dimension)}; give a number above 0 "
+            f"the accuracy goal is {robot.to_quantity(goal, dimension)}. Give a number above 0 "
             "with its unit, such as 20um"
         )
     design, count = problem.pose_design(name="I"), problem.n_candidates

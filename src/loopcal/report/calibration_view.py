@@ -233,7 +233,7 @@ def build_parameter_table(
         cells.append((*shown, interval, row["unit"]))
     titles = ["nominal", "estimate", "+/- (95 %)"]
     if is_complete:
-        titles[2:] = ["shift [tolerances]", "u", "degrees of freedom", "k", "U (95 %)"]
+        titles[2:] = ["shift [expected spreads]", "u", "degrees of freedom", "k", "U (95 %)"]
     return make_table(caption, ("name", *map(Column, titles), "unit"), cells)
 
 
@@ -259,14 +259,14 @@ def build_prior_table(conflict: PriorConflict) -> Table:
     )
     numbers = (Column(title) for title in ("statistic [1]", "degrees or number", "p"))
     p_value = format_number(conflict.joint_p_value, 2)
-    caption = f"Stated tolerances against the data: p = {p_value} for the three tests together"
+    caption = f"Expected spreads against the data: p = {p_value} for the three tests together"
     return make_table(caption, ("test", *numbers, "parameters"), rows)
 
 
 def build_last_value_table(rows: Iterable[Mapping[str, Any]]) -> Table:
     """Return the values at which an iteration ended that did not converge, without precision."""
     return build_table(
-        "Where the iteration ended (no estimates)",
+        "Values at the end of the iteration (no estimates)",
         rows,
         Field("name"),
         Field("nominal"),
@@ -312,9 +312,11 @@ def _describe_iteration(fit: Identification) -> str:
 
 MEANING = (
     "Standard uncertainties (k = 1): root mean square over {poses} {over}, tool point, and the "
-    "parameter that is known worst in tolerances. Their squares add up. Setup parameters: what not "
-    "knowing them adds to an instrument with a known setup. Type A: evaluated by statistics; type "
-    "B: stated. Halved: what remains with half the sigma of this source, all weights changed."
+    "parameter known worst relative to its expected spread. Their squares add up. Setup "
+    "parameters: what "
+    "not knowing them adds to an instrument with a known setup. Type A: evaluated by statistics. "
+    "Type B: by other means. Halved: what remains with half the sigma of this source, all weights "
+    "changed."
 )
 
 
@@ -485,7 +487,7 @@ def view_compensation(result: Compensation) -> list[Block]:
         is_of_all = uncertainty.reference.data["frame"] in ("fitted", "base")
         others = "" if is_of_all else " Errors before and after are in the base frame."
         blocks.append(
-            "Errors are distances and angles. 95 % of those of the machine after compensation are "
+            "Errors are distances and angles. 95 % of the machine's errors after compensation are "
             f"below U. Frame{'' if is_of_all else ' of U'}: {uncertainty.frame}.{others}"
         )
     return blocks

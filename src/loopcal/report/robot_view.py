@@ -98,7 +98,7 @@ def _build_triangle_table(robot: Mechanism) -> Table:
         map(Column, titles)
         for titles in (("shortest", "longest"), ("joint at shortest", "at longest"))
     )
-    caption = "Triangles: dead points, where a drive turns nothing"
+    caption = "Triangles: dead points of a drive"
     return make_table(caption, ("drive", *lengths, "unit", *angles, "unit"), rows)
 
 

@@ -48,10 +48,9 @@ READING_NOISE = (
 """Sentence for robots whose readings are uncertain."""
 
 COMMANDED = (
-    "These errors and the statements on limits compare predicted with measured poses at the same "
-    "readings. No reading corrects coordinates that are not commanded: with the calibrated values "
-    "they still differ from those of the geometry before calibration by {errors} (rms, without "
-    "noise)."
+    "These errors and the decisions on limits compare predicted with measured poses at equal "
+    "readings. Readings only correct commanded coordinates. The others still differ from the "
+    "geometry before calibration by {errors} (rms, without noise)."
 )
 """Sentence for robots whose geometric errors also move what they cannot command."""
 
@@ -103,12 +102,12 @@ def view_errors(validation: Validation, what: str, with_before: bool = True) -> 
     if validation.quantities:
         caption = f"Errors at {poses}, {validation.frame}"
         blocks.append(_build_error_summary(validation, caption, with_before))
-        divided = "The same divided by sigma"
+        divided = "Errors divided by sigma"
     blocks += _build_kind_summary(validation, divided, with_before)
     if (rest := validation.without_blunders) is not None and rest.judged:
         labels = [label for blunder in validation.blunders for label in blunder.poses]
         noun = "pose" if len(labels) == 1 else "poses"
-        caption = f"The same without {noun} {list_names(labels)}"
+        caption = f"Without {noun} {list_names(labels)}"
         if rest.quantities:
             blocks.append(_build_error_summary(rest, caption, with_before))
         else:
@@ -227,7 +226,7 @@ def _compare(change: ErrorChange) -> str:
     if change.is_noise:
         return "within the noise before and after calibration"
     if abs(change.times - 1.0) < SIMILAR:
-        return "the same before and after calibration"
+        return "equal before and after calibration"
     if math.isinf(change.times):
         return "zero after calibration"
     if change.times > 1.0:
@@ -269,10 +268,10 @@ def view_repeatability(result: Repeatability, robot: Mechanism | None = None) ->
 # Several calibrations side by side: findings, parameters, shifts, and errors at the same poses.
 
 SHIFTS = (
-    "Shifts from {first}, with all other parameters free to have changed as well. They follow from "
-    "the data alone; estimates are also drawn to nominal by the tolerances. A shift is significant "
-    "(*) at 5 % for all parameters and runs together. A dash: the data of both runs do not "
-    "determine it, or the runs are not tested."
+    "Shifts from {first}, with all other parameters free to have changed as well. They follow "
+    "from the data alone; estimates are also drawn to nominal by the tolerances. A shift is "
+    "significant (*) at 5 % for all parameters and runs together. A dash: undetermined by the "
+    "data of both runs, or not tested."
 )
 
 
@@ -413,7 +412,7 @@ def view_regularization(curves: RegularizationCurves) -> list[Block]:
     ]
     if curves.assumed:
         page.append(
-            f"{curves.assumed} parameters have no stated tolerance; assumed ones scale them."
+            f"{curves.assumed} parameters have no expected spread. Assumed values scale them."
         )
     if curves.scheme == "folds":
         page.append(

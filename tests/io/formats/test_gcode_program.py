@@ -86,7 +86,7 @@ def test_stops_that_cannot_be_reached_are_refused(folder) -> None:
 def test_coordinates_without_a_word_are_refused(folder) -> None:
     (folder / "p.csv").write_text("step,pose,use,z [mm],phi [deg],theta [deg]\n1,1,fit,700,0,1\n")
     robot = load_robot("3-prs")
-    with pytest.raises(DataError, match="commanded in phi and theta, which have no word"):
+    with pytest.raises(DataError, match="has the commands phi and theta, which have no word"):
         read_stops("p.csv", robot)
 
 
@@ -97,7 +97,7 @@ def test_other_files_and_settings_are_refused(folder) -> None:
     with pytest.raises(FileError, match="the use 'visit' is not fit, held-out or via"):
         read_stops("plan.csv", robot)
     (folder / "plan.csv").write_text("pose,q1 [mm]\n1,2\n")
-    with pytest.raises(FileError, match="name the folder of a plan"):
+    with pytest.raises(FileError, match="Name the folder of a plan"):
         read_stops("plan.csv", robot)
     settings = ((0.0, None), (np.nan, None), (np.inf, None), (1.0, -1.0), (1e-9, None), (1.0, 4e-4))
     for feed, pause in settings:  # also those that three decimals round to 0

@@ -156,11 +156,11 @@ def test_keys_that_are_not_read_are_reported(tmp_path) -> None:
     }
     _, imported = read(tmp_path, simulate_example() | more)
     notes = " | ".join(map(str, imported.findings))
-    assert "41 rows of line forces are not read" in notes
+    assert "does not read 41 rows of line forces" in notes
     assert "with 45 rows of motor angles" in notes
-    for words in ("stiffness", "weight", "the key 'colour' is unknown"):
+    for words in ("stiffness", "weight", "the unknown key 'colour'"):
         assert words in notes
-    assert "1 mm is used for lines" in notes
+    assert "assumed 1 mm for lines" in notes
 
 
 @pytest.mark.parametrize(
@@ -169,7 +169,7 @@ def test_keys_that_are_not_read_are_reported(tmp_path) -> None:
         ({"motor_pos_samp": None}, "'motor_pos_samp' is not a list of rows of numbers"),
         (
             {"motor_pos_samp": [[1, 2, 3, 4], [1, 2, 3]]},
-            "row 2 of 'motor_pos_samp' has 3 numbers, but 4 are needed",
+            "row 2 of 'motor_pos_samp' has 3 numbers instead of 4",
         ),
         ({"motor_pos_samp": [[1, 2, 3, "x"]]}, "'motor_pos_samp' is not a list of rows of numbers"),
         ({"motor_pos_samp": [[1, 2]]}, "has 2 motors in a row"),
@@ -177,18 +177,18 @@ def test_keys_that_are_not_read_are_reported(tmp_path) -> None:
             {"motor_pos_samp": [[1, 2, 3, 4]]},
             "'xyz_of_samp' has 9 poses, but 'motor_pos_samp' only 1",
         ),
-        ({"xyz_of_samp": [[1, 2]]}, "row 1 of 'xyz_of_samp' has 2 numbers, but 3 are needed"),
+        ({"xyz_of_samp": [[1, 2]]}, "row 1 of 'xyz_of_samp' has 2 numbers instead of 3"),
         ({"xyz_of_samp": [[1, 2, float("inf")]]}, "the number Infinity is not finite"),
         (
             {"mechanical_advantage": [2, 2, 2]},
             "'mechanical_advantage' is not a list of numbers, 4 in all",
         ),
-        ({"mechanical_advantage": [2, 2, 2, 0]}, "write positive numbers"),
+        ({"mechanical_advantage": [2, 2, 2, 0]}, "Write positive numbers"),
         ({"spool_gear_teeth": "many"}, "'spool_gear_teeth' is not a number"),
         ({"anchors": [[1, 2, 3]]}, "'anchors' has 1 rows, but there are 4 lines"),
-        ({"xyz_of_samp": []}, "no pose is known; add known poses"),
+        ({"xyz_of_samp": []}, "no pose is known. Add known poses"),
         ({"xyz_of_samp": [[0, 0, 0]]}, "the 1 known poses do not determine the anchor of line A"),
-        *(({TAPED: lengths}, "a list of 4 lengths in mm is needed") for lengths in WRONG_LENGTHS),
+        *(({TAPED: lengths}, "must be a list of 4 lengths in mm") for lengths in WRONG_LENGTHS),
         *(({TAPED: [v, 1, 1, 1]}, "is not finite") for v in (float("inf"), float("nan"))),
     ],
 )

@@ -215,5 +215,5 @@ def test_invalid_file_is_refused_in_one_sentence(tmp_path, name, text, sentence)
 
 
 def test_a_hal_file_states_no_unit_of_length(tmp_path) -> None:
-    with pytest.raises(FileError, match="a HAL file states no unit of length"):
+    with pytest.raises(FileError, match="a HAL file contains no unit of length"):
         read(tmp_path / "file", "linuxcnc", GENHEX, length_unit=None)

@@ -71,12 +71,12 @@ def observe_correlated(a, b=None):
 
 REFUSED = {
     # settings of kinds
-    "the targets are empty; name at least one": lambda: Position(targets=()),
-    "the targets are a, a; name at least one, and each once": lambda: Position(targets=("a", "a")),
-    r"number of places is 1, but there are 2 targets \(a, b\); state one place": lambda: Position(
+    "the targets are empty. Name at least one": lambda: Position(targets=()),
+    "the targets are a, a. Name at least one, and each once": lambda: Position(targets=("a", "a")),
+    r"number of places is 1, but there are 2 targets \(a, b\). Give one place": lambda: Position(
         targets=("a", "b"), places=POINT
     ),
-    "'tracker' cannot be unknown in the kind 'position'; allowed are frame, targets": (
+    "'tracker' cannot be unknown in the kind 'position'. Allowed: frame, targets": (
         lambda: Position(unknown=("tracker",))
     ),
     "T_base_frame is not a pose": lambda: Position(T_base_frame=2.0 * np.eye(4)),
@@ -84,32 +84,32 @@ REFUSED = {
         lambda: Pose(T_base_frame=np.diag([1.0, 1.0, -1.0, 1.0]))
     ),
     r"T_platform_tool has shape \(3, 3\)": lambda: Pose(T_platform_tool=np.eye(3)),
-    "in the kind 'pose'; allowed are frame, tool, bias, drift": lambda: Pose(unknown=("offset",)),
-    "the component 'w' does not exist; use x, y, z; declare an orientation": (
+    "in the kind 'pose'. Allowed: frame, tool, bias, drift": lambda: Pose(unknown=("offset",)),
+    "the component 'w' does not exist. Use x, y, z; declare an orientation": (
         lambda: Component(("w",))
     ),
     "declare an orientation to measure angles": lambda: Component(("phi", "theta")),
-    "use phi, theta, psi, x, y, z": lambda: Component(("a",), "tilt-torsion"),
-    "the components are z, z; name .* each once": lambda: Component(("z", "z")),
-    "the components are empty; name at least one": lambda: Component(()),
-    "phi is measured without theta": lambda: Component(("phi",), "tilt-torsion"),
+    "Use phi, theta, psi, x, y, z": lambda: Component(("a",), "tilt-torsion"),
+    "the components are z, z. Name .* each once": lambda: Component(("z", "z")),
+    "the components are empty. Name at least one": lambda: Component(()),
+    "phi needs theta": lambda: Component(("phi",), "tilt-torsion"),
     "components of a rotation-vector cannot be": lambda: Component(("x",), "rotation-vector"),
     "is not one of the 24": lambda: Component(("a",), "euler-xxy"),
-    "orientation form 'rpy'; use rotation-vector, quaternion, tilt-torsion, or euler-": (
+    "orientation form 'rpy'. Use rotation-vector, quaternion, tilt-torsion, or euler-": (
         lambda: Component(("a",), "rpy")
     ),
-    "the form of a bearing is 'telescope'; use theodolite or camera": (
+    "the form of a bearing is 'telescope'. Use theodolite or camera": (
         lambda: Bearing(form="telescope")
     ),
-    "the anchor: row 2 is nan; give a finite number": lambda: Distance(
+    "the anchor: row 2 is nan. Give a finite number": lambda: Distance(
         anchor=np.array([0.0, np.nan, 0.0])
     ),
     "the direction of the surface is 0, 0, 0": lambda: Plane(along=np.zeros(3)),
-    "the radius of a sphere is 0.0 m; give a length above 0": lambda: Sphere(radius=0.0),
+    "the radius of a sphere is 0.0 m. Give a length above 0": lambda: Sphere(radius=0.0),
     "the axis is 0, 0, 0": lambda: Direction(axis=np.zeros(3)),
-    "allowed are mounting, gravity": lambda: Inclination(unknown=("frame",)),
-    "the joints are empty; name at least one": lambda: JointSensor(joints=()),
-    "the joints measure 'force'; use length or angle": lambda: JointSensor(measures="force"),
+    "Allowed: mounting, gravity": lambda: Inclination(unknown=("frame",)),
+    "the joints are empty. Name at least one": lambda: JointSensor(joints=()),
+    "the joints measure 'force'. Use length or angle": lambda: JointSensor(measures="force"),
     # values of rows
     "row 2 of kind 'distance' has a distance of 0 m; a distance is above 0": (
         lambda: observe([1.0], [0.0], kind=Distance(places=POINT))
@@ -141,13 +141,13 @@ REFUSED = {
         lambda: observe([0.0, 1.6], kind=Autocollimation())
     ),
     # shapes and numbers of observations
-    r"measured values of kind 'component' \(x, y, z\) has shape \(2, 4\); give .*\(2, 3\)": (
+    r"measured values of kind 'component' \(x, y, z\) has shape \(2, 4\). Give .*\(2, 3\)": (
         lambda: observe_points(measured=np.zeros((2, 4)))
     ),
-    "row 1, column 2 is inf; give a finite number or NaN": (
+    "row 1, column 2 is inf. Give a finite number or NaN": (
         lambda: observe_points(measured=[[1.0, np.inf, 0.0], [0.0] * 3])
     ),
-    "give whole numbers of shape": lambda: observe_points(rows=[0.5, 1.0]),
+    "Give whole numbers of shape": lambda: observe_points(rows=[0.5, 1.0]),
     r"has shape \(2, 3\)": lambda: observe_points(rows=[0]),
     "covariance of row 1 has a variance that is not above 0": (
         lambda: observe_points(covariance=np.diag([1.0, 0.0, 1.0]))
@@ -160,20 +160,20 @@ REFUSED = {
     ),
     "weight of row 2 is -1": lambda: observe_points(weight=[1.0, -1.0]),
     "the weight: row 2 is nan": lambda: observe_points(weight=[1.0, np.nan]),
-    r"covariance has shape \(2, 2\); give \(2, 3, 3\) or \(3, 3\)": (
+    r"covariance has shape \(2, 2\). Give \(2, 3, 3\) or \(3, 3\)": (
         lambda: observe_points(covariance=np.eye(2))
     ),
-    r"the weight has shape \(3,\); give one number for each of 2 rows": (
+    r"the weight has shape \(3,\). Give one number for each of 2 rows": (
         lambda: observe_points(weight=[1.0, 1.0, 1.0])
     ),
-    r"sigma has shape \(2,\); give one number, or one for each of rx, ry, rz, x, y, z": (
+    r"sigma has shape \(2,\). Give one number, or one for each of rx, ry, rz, x, y, z": (
         lambda: observe([0.0] * 6, kind=POSE, sigma=[1.0, 2.0])
     ),
-    r"\(rx, ry, rz, x, y, z\) has shape \(1, 5\); .* \(any, 6\)": lambda: observe(
+    r"\(rx, ry, rz, x, y, z\) has shape \(1, 5\).* \(any, 6\)": lambda: observe(
         [0.0] * 5, kind=POSE
     ),
     # measurements and their readings
-    "readings: row 1, column 2 is nan; give a finite number": (
+    "readings: row 1, column 2 is nan. Give a finite number": (
         lambda: record(readings=[[1.0, np.nan], [0.0, 0.0]])
     ),
     r"readings has shape \(2,\)": lambda: record(readings=[1.0, 2.0]),
@@ -181,19 +181,19 @@ REFUSED = {
     "row 2 of kind 'component' refers to pose 1, but the 1 poses are 0 to 0": (
         lambda: record(readings=[[1.0, 2.0]])
     ),
-    "give one whole number for each pose": lambda: record(block=np.array([1])),
+    "Give one whole number for each pose": lambda: record(block=np.array([1])),
     "1 labels for 2 poses": lambda: record(labels=("a",)),
     "sigma -1e-06 .* not a standard deviation": lambda: record_readings(-1e-6),
     "sigma nan .* not a standard deviation": lambda: record_readings(np.nan),
     "missing reading": lambda: record_readings(1e-6, (1.0, np.nan)),
     "one for each of the 2 actuators": lambda: record_readings(np.ones(3)),
-    "column 2 is nan; give a finite number, or": lambda: record_readings(None, (1.0, np.nan)),
-    "column 2 is inf; give a finite": lambda: record_readings(np.inf, (1.0, np.inf)),
+    "column 2 is nan. Give a finite number, or": lambda: record_readings(None, (1.0, np.nan)),
+    "column 2 is inf. Give a finite": lambda: record_readings(np.inf, (1.0, np.inf)),
     # sensors and their noise
     "the sigma of the noise contains 0": lambda: Gaussian(np.array([0.0])),
     "the sigma of the noise contains -1": lambda: Gaussian(np.array([-1.0])),
     "the sigma of the noise: row 1 is nan": lambda: Gaussian(np.array([np.nan])),
-    "give one for each of rx, ry, rz, x, y, z": lambda: Sensor(POSE, Gaussian(np.ones(1))),
+    "Give one for each of rx, ry, rz, x, y, z": lambda: Sensor(POSE, Gaussian(np.ones(1))),
     "at least one sensor": lambda: Instrument(()),
     "refer to pose 7, but the 4 poses are 0 to 3": (
         lambda: Sensor(BAR, Gaussian(np.ones(1)), rows=np.array([[0, 7]])).assign_rows(4)
@@ -202,24 +202,24 @@ REFUSED = {
         lambda: Sensor(BAR, Gaussian(np.ones(1))).assign_rows(1)
     ),
     # arguments of another type
-    "readings: got the text 'data.csv'; give an array": lambda: record(readings="data.csv"),
-    "observations: got the text 'rows.csv'; give Observations": (
+    "readings: got the text 'data.csv'. Give an array": lambda: record(readings="data.csv"),
+    "observations: got the text 'rows.csv'. Give Observations": (
         lambda: record(observations=("rows.csv",))
     ),
-    "kind: got the text 'pose'; give Kind, such as": lambda: observe_points(kind="pose"),
-    r"\(x, y, z\): got the text 'data.csv'; give an array": (
+    "kind: got the text 'pose'. Give Kind, such as": lambda: observe_points(kind="pose"),
+    r"\(x, y, z\): got the text 'data.csv'. Give an array": (
         lambda: Observations.from_sigma(POINTS, [0], "data.csv", 1.0)
     ),
-    "noise: got a float; give Noise, such as": (
+    "noise: got a float. Give Noise, such as": (
         lambda: Sensor(POSE, 1e-5)  # type: ignore[arg-type]
     ),
-    "robot: got the text 'hexapod-42'; give Mechanism, from loopcal.load_robot": (
+    "robot: got the text 'hexapod-42'. Give Mechanism, from loopcal.load_robot": (
         lambda: sample_truth("hexapod-42", 1, 0)  # type: ignore[arg-type]
     ),
-    "instrument: got the text 'pose'; give Instrument": (
+    "instrument: got the text 'pose'. Give Instrument": (
         lambda: simulate(zoo.hexapod(), POSES, "pose", 1)  # type: ignore[arg-type]
     ),
-    "got the text '1 um'; give an array": lambda: Gaussian("1 um"),  # type: ignore[arg-type]
+    "got the text '1 um'. Give an array": lambda: Gaussian("1 um"),  # type: ignore[arg-type]
 }
 
 

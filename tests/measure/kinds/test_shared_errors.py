@@ -99,7 +99,7 @@ def test_a_scale_multiplies_lengths_and_leaves_angles(kind):
 
 @pytest.mark.parametrize("kind", [Bearing(), KINDS["direction"](), KINDS["inclination"]()])
 def test_what_measures_angles_has_no_scale(kind):
-    with pytest.raises(DataError, match="measures angles, which have no scale; remove 'scale'"):
+    with pytest.raises(DataError, match=r"measures angles, which have no scale. Remove 'scale'"):
         dataclasses.replace(kind, unknown=("scale",))
 
 

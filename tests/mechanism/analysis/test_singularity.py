@@ -180,7 +180,7 @@ def test_workspace_is_refused_where_drawing_from_it_would_take_long(share, is_re
 
 
 def test_missing_range_of_a_workspace_is_named():
-    with pytest.raises(MechanismError, match="states no workspace for y"):
+    with pytest.raises(MechanismError, match="has no workspace for y"):
         sample_workspace(build_delta_with_workspace({"x": (-0.1, 0.1), "z": (0.0, 0.1)}), 10)
 
 

@@ -273,7 +273,7 @@ def test_exceeded_joint_limits_and_cones_are_reported() -> None:
 INVALID_RECORDS = {
     "branch": (
         replace(SLIDER, limbs=(*SLIDER.limbs, replace(SLIDER.limbs[0], name="branch", on="rod"))),
-        "limb 'branch1' names 'rod', which is not a body; add it to `bodies:`",
+        "limb 'branch1' names 'rod', which is not a body. Add it to `bodies:`",
     ),
     "end on a limb": (change_limb(to="elbow"), "limb 'rod1' names 'elbow', which is not a body"),
     "idle drive": (
@@ -282,11 +282,11 @@ INVALID_RECORDS = {
     ),
     "wrong drive": (
         replace(SLIDER, drives={"q": AngleDrive(reads="angle")}),
-        "drives a joint that slides; state reads: length",
+        "drives a joint that slides. Give reads: length",
     ),
     "no such term": (
         replace(SLIDER, drives={"q": LengthDrive(reads="length", unknown=("radius",))}),
-        "no term 'radius'; allowed are offset, gain, curve, backlash",
+        "no term 'radius'. Allowed: offset, gain, curve, backlash",
     ),
     "no period": (
         replace(SLIDER, drives={"q": LengthDrive(reads="length", unknown=("sin1",))}),
@@ -312,16 +312,16 @@ INVALID_RECORDS = {
     ),
     "axis zero": (
         change_limb(chain=(Prismatic("P", axis=(0.0, 0.0, 0.0), actuated="q"),)),
-        "state a direction",
+        "Give a direction",
     ),
     "no copies": (change_limb(copies=Copies(0)), "has 0 copies"),
     "copies about no axis": (
         change_limb(copies=Copies(3, (0.0, 0.0, 0.0))),
-        "a copy has the axis [0, 0, 0]; state a direction",
+        "a copy has the axis [0, 0, 0]. Give a direction",
     ),
     "unknown owner": (
         replace(SLIDER, parameters=(NamedLength("r", 0.1, (MapEntry("arm", "P1", "x"),)),)),
-        "'r' is mapped onto 'arm', which is not there; known are rod, q1, q2",
+        "'r' is mapped onto 'arm', which is not there. Known: rod, q1, q2",
     ),
 }
 
@@ -414,7 +414,7 @@ FREEDOMS = {
     "controlled left out": (
         ("controlled: [x, y]\n", ""),
         (
-            "five-bar names no controlled coordinate; state one for each freedom, of x, y, z, "
+            "five-bar names no controlled coordinate. Give one for each freedom, of x, y, z, "
             "roll, "
             "pitch, yaw, phi, theta, psi"
         ),
@@ -425,11 +425,11 @@ FREEDOMS = {
     ),
     "freedoms empty": (
         ("freedoms: [x, y]", "freedoms: []"),
-        "five-bar has no freedoms; state those of its platform, of rx,",
+        "five-bar has no freedoms. Give those of its platform, of rx,",
     ),
     "freedoms twice": (
         ("freedoms: [x, y]", "freedoms: [x, x, y]"),
-        "duplicate freedom 'x' in x, x, y; name each once",
+        "duplicate freedom 'x' in x, x, y. Name each once",
     ),
 }
 
@@ -464,7 +464,7 @@ INVALID_VALUES = {
     "drive mistyped": (
         ("actuated: q", "actuated: w"),
         (
-            "actuator 'q' drives no joint; write 'actuated: q' at one, or leave it out; joints are "
+            "actuator 'q' drives no joint. Write 'actuated: q' at one, or leave it out; joints are "
             "driven by w1, w2, w3"
         ),
     ),
@@ -492,7 +492,7 @@ def test_file_without_limbs_is_refused(tmp_path: Path) -> None:
     path.write_text(text[: text.index("limbs:\n")] + "limbs: []\n" + text[text.index("home:") :])
     with pytest.raises(
         LoopcalError,
-        match="rotary-delta has no limbs; write those that join the base to the platform",
+        match=r"rotary-delta has no limbs. Write those that join the base to the platform",
     ):
         load_robot(path)
 
@@ -509,39 +509,39 @@ ON_ARM = "limb: arm, element: motor, axis: "
 MAPS = {
     "angle onto x": (
         ("angle", ON_ARM + "x"),
-        "parameter 'p' is an angle and x of 'arm' a length; state an `arm:` [length per radian]",
+        "parameter 'p' is an angle and x of 'arm' a length. Give an `arm:` [length per radian]",
     ),
     "angle onto rod": (
         ("angle", "limb: arm, element: rod, axis: length"),
-        "is an angle and length of 'arm' a length; state an",
+        "is an angle and length of 'arm' a length. Give an",
     ),
     "ratio onto x": (
         ("ratio", ON_ARM + "x"),
-        "parameter 'p' is a ratio and x of 'arm' a length; state an `arm:`",
+        "parameter 'p' is a ratio and x of 'arm' a length. Give an `arm:`",
     ),
     "length onto rx": (
         ("length", ON_ARM + "rx"),
-        "parameter 'p' is a length and rx of 'arm' an angle; state it as an angle",
+        "parameter 'p' is a length and rx of 'arm' an angle. Give it as an angle",
     ),
     "arm of a length": (
         ("length", ON_ARM + "x, arm: 2"),
-        "parameter 'p' is a length with an arm; leave the arm out",
+        "parameter 'p' is a length with an arm. Leave the arm out",
     ),
     "arm onto rx": (
         ("angle", ON_ARM + "rx, arm: 2"),
-        "is an angle with an arm and rx of 'arm' an angle; leave the arm out",
+        "is an angle with an arm and rx of 'arm' an angle. Leave the arm out",
     ),
     "length onto offset": (
         ("length", "limb: q1, element: transmission, axis: offset"),
-        "is a length and offset of 'q1' an angle; state it as an angle",
+        "is a length and offset of 'q1' an angle. Give it as an angle",
     ),
     "angle onto gain": (
         ("angle", "limb: q1, element: transmission, axis: gain"),
-        "is an angle and gain of 'q1' a ratio; state it as a ratio",
+        "is an angle and gain of 'q1' a ratio. Give it as a ratio",
     ),
     "pitch": (
         ("length", ON_ARM + "pitch"),
-        "parameter 'p' is mapped onto 'pitch'; use lead, the advance in one turn",
+        "parameter 'p' is mapped onto 'pitch'. Use lead, the advance in one turn",
     ),
 }
 

@@ -135,7 +135,7 @@ def test_wrong_shapes_of_readings_and_targets_are_refused():
         forward(zoo.hexapod(), np.zeros((2, 5)))
     with pytest.raises(
         DataError,
-        match=r"a target of shape \(2, 5\) was given; allowed are \(n, 4, 4\) poses or \(n, 3\)",
+        match=r"a target of shape \(2, 5\) was given. Allowed: \(n, 4, 4\) poses or \(n, 3\)",
     ):
         inverse(zoo.delta(), np.zeros((2, 5)))
 

@@ -447,7 +447,7 @@ def test_a_stage_on_a_named_one_branches_off_it(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "line", "sentence"),
     [
-        ("mount:", "on: shoulde\n    mount:", 9, "not a stage .*; allowed are base, shoulder$"),
+        ("mount:", "on: shoulde\n    mount:", 9, "not a stage .*. Allowed: base, shoulder$"),
         (
             "    joint: {kind: R, start: 20",
             "    on: elbow\n    joint: {kind: R, start: 20",

@@ -25,30 +25,29 @@ def calibrate(
     robot: str = opt.ROBOT,
     data: tuple[Path, ...] = opt.data(),
     output: Path | None = opt.path(
-        "Run folder to make; without it the result is only shown.", "-o"
+        "Run folder to make. Without it the result is only shown.", "-o"
     ),
     hold_out: float = opt.option(
         "Share of the poses, from 0 to below 1, to keep out of the fit for validation, such as "
-        "0.25. The poses are those of data.split(hold_out=SHARE, seed=SEED) in Python.",
+        "0.25. In Python: data.split(hold_out=SHARE, seed=SEED).",
         of="loopcal.apply.calibration_options:CalibrationOptions",
         type=opt.POSE_SHARE,
     ),
     fit: lc.FitOptions = opt.FIT,
     choose_model: bool = opt.flag(
         "Free only as many parameters as held-out predictions justify: offsets, then lengths, "
-        "ideal, complete, and what the controller stores; prints their condition numbers."
+        "ideal, complete, and what the controller stores. Prints their condition numbers."
     ),
     prior: Path | None = opt.path(
-        "Run folder of an earlier calibration of this machine, which is used as the prior.",
-        metavar="RUN",
+        "Run folder of an earlier calibration of this machine, as the prior.", metavar="RUN"
     ),
     compare: Path | None = opt.path(
-        "Stored values to compare with the estimate, such as those of a firmware: a robot file, "
-        "or a file with the table 'identified' of some parameters."
+        "Stored values to compare with the estimate, such as from a firmware: a robot file, or a "
+        "file with the table 'identified' of some parameters."
     ),
     free_limb: str | None = opt.option(
-        "With --prior: a limb that was repaired, such as leg3, whose parameters return to nominal "
-        "with their tolerances.",
+        "With --prior: a repaired limb, such as leg3, whose parameters return to nominal with "
+        "their expected spreads.",
         metavar="LIMB",
     ),
     frame: str = opt.frame(OPTIONS),
@@ -65,16 +64,16 @@ def calibrate(
     """Identify the free parameters of ROBOT from DATA, validate them on held-out poses, and with -o
     write a run folder with the corrected robot file.
 
-    DATA may be several files, which are joined by the names of poses.
+    DATA may be several files, joined by the names of poses.
 
     The verdict is one of
       calibrated                    use the result
-      calibrated with reservations  usable; a warning affects its accuracy
+      calibrated with reservations  usable, with a warning that affects accuracy
       undecided                     no held-out poses, or too few
-      not calibrated                exit code 2; the run folder is still written, but its robot
+      not calibrated                exit code 2. The run folder is still written, but its robot
                                     file is called robot-not-calibrated.yaml
 
-    "Not calibrated" means that the fit did not converge, the residuals contradict the stated noise,
+    "Not calibrated" means that the fit did not converge, the residuals contradict the given noise,
     errors on held-out poses grew, or a limit is exceeded.
 
     Examples:
@@ -122,7 +121,7 @@ def calibrate(
     with terminal.TerminalProgress() as progress:
         report = lc.calibrate(machine, measurements, settings, progress)
     opt.print_convention_note(report.conventions, data)
-    written = "Nothing was written; -o RUN keeps the result and the corrected robot file."
+    written = "No file written: use -o RUN to keep the result and the corrected robot file."
     if output is not None:
         with terminal.TerminalProgress("writing the run folder"):
             lc.save_run(report, output, inputs, opt.list_words(), force)
@@ -138,11 +137,11 @@ def calibrate(
 
 @opt.command()
 def budget(run: Path = opt.RUN) -> Output:
-    """Show the uncertainty budget of RUN, a run folder: what each source of errors contributes to
-    poses and parameters, and what half its sigma would gain.
+    """Show the uncertainty budget of RUN, a run folder: the contribution of each source to poses
+    and parameters, and the effect of half its sigma.
 
-    The frame of the pose errors is that of the calibration, see its option --frame. A run without
-    intervals has no budget.
+    Pose errors are in the frame of the calibration (option --frame). A budget needs a run with
+    intervals.
 
     Examples:
       loopcal budget run
@@ -162,10 +161,10 @@ def accuracy(
     frame: str = opt.frame("loopcal.apply.volume_accuracy:bound_errors"),
     limit_position: float | None = opt.LIMIT_POSITION,
 ) -> Output:
-    """State the largest position error of the tool in a volume, with a confidence of 95 %.
+    """Compute the largest position error of the tool in a volume, with a confidence of 95 %.
 
-    The errors of all points of the volume are at most the first number together (simultaneously);
-    the second holds for each single point (pointwise). RUN is a run folder.
+    The first number bounds the errors of all points of the volume together (simultaneously), and
+    the second each single point (pointwise). RUN is a run folder.
 
     Examples:
       loopcal accuracy run --volume x=-40mm..40mm --volume y=-40mm..40mm
@@ -188,23 +187,22 @@ def validate(
     limit_angle: float | None = opt.LIMIT_ANGLE,
     allowed: dict[str, bool] = opt.ALLOWED,
     refit: tuple[str, ...] = opt.option(
-        "Frame, target or surface that was moved since RUN, to be fitted to DATA again. May be "
-        "given several times.",
+        "Frame, target or surface that moved since RUN, to fit to DATA again. Repeatable.",
         multiple=True,
         metavar="NAME",
     ),
-    allow_fitted_data: bool = opt.flag("Accept measurements that the run was fitted to."),
+    allow_fitted_data: bool = opt.flag("Accept measurements that the run also used."),
     verbose: bool = opt.VERBOSE,
 ) -> Output:
     """Compare the robot of RUN, a run folder or a robot file, with DATA, one file or several.
 
-    The errors are those before and after calibration; of a robot file without identified values
-    there is only one. The noise floor is the error that the measurement noise alone causes.
+    A run has errors before and after calibration, a robot file without identified values only one.
+    The noise floor is the error that the measurement noise alone causes.
 
-    Frames, targets and surfaces keep their values in RUN, by name. Others are fitted to DATA,
-    which makes the errors optimistic; a note says so.
+    Frames, targets and surfaces keep their values in RUN, by name. Others are fitted to DATA: the
+    errors are then optimistic, as a note says.
 
-    The exit code is 2 where a limit is exceeded.
+    Above a limit the exit code is 2.
 
     Examples:
       loopcal validate run more-measurements.csv
@@ -249,14 +247,14 @@ def validate(
 def compensate(
     run: Path = opt.RUN,
     targets: Path = opt.argument("TARGETS", type=opt.FILE),
-    output: Path | None = opt.path("CSV file to write; without it the CSV text is printed.", "-o"),
+    output: Path | None = opt.path("CSV file to write. Without it the CSV text is printed.", "-o"),
     mode: Literal["readings", "commands"] = opt.option(
-        "Actuator readings to set, or shifted commands for a controller that cannot be changed.",
+        "Actuator readings to set, or shifted commands for a controller with a fixed geometry.",
         of="loopcal.apply.compensation:compensate",
         type=opt.Words("loopcal.apply.compensation:Mode"),
     ),
     controller: str | None = opt.option(
-        "Robot file with the geometry of the controller; by default the nominal robot.",
+        "Robot file with the geometry of the controller. Default: the nominal robot.",
         metavar="ROBOT",
     ),
     steps: int = opt.option(
@@ -274,11 +272,10 @@ def compensate(
     """Compute readings or commands with which the machine of RUN reaches TARGETS, a CSV file of
     controlled coordinates.
 
-    RUN is a run folder, or a robot file (then no uncertainty is known). Each target states the
-    error before and after compensation, what no actuator can correct, and its uncertainty.
+    RUN is a run folder, or a robot file (without uncertainty). Each target gets its error before
+    and after compensation, the part that actuators cannot correct, and its uncertainty.
 
-    The exit code is 2 where a target cannot be reached, or where RUN failed; then nothing is
-    written without --force.
+    The exit code is 2 if a target is out of reach or RUN failed. Only --force then writes files.
 
     Examples:
       loopcal compensate run targets.csv -o readings.csv
@@ -325,8 +322,9 @@ def compensate(
 def certificate(run: Path = opt.RUN, facts: Path = opt.argument("FACTS", type=opt.FILE)) -> Output:
     """Print a digital calibration certificate of RUN: XML by PTB's schema DCC 3.3.0.
 
-    FACTS is a YAML file with what a run does not know: laboratory, customer, dates, serial number.
-    Instruments are those that the measurement files state.
+    FACTS is a YAML file with facts outside the run: laboratory, customer, dates, serial number. The
+    instruments come from the measurement files. Expanded uncertainties rest on the prior of the
+    calibration.
 
     Examples:
       loopcal new --report-facts facts.yaml
@@ -343,7 +341,7 @@ def certificate(run: Path = opt.RUN, facts: Path = opt.argument("FACTS", type=op
 def compare(
     runs: tuple[Path, ...] = opt.argument("RUN...", type=opt.FILE, nargs=-1, required=True),
     data: tuple[Path, ...] = opt.option(
-        "Measurements at which the errors of all runs are compared. May be given several times.",
+        "Measurements for comparing the errors of all runs. Repeatable.",
         type=opt.FILE,
         multiple=True,
         metavar="DATA",
@@ -358,13 +356,11 @@ def compare(
 ) -> Output:
     """Compare calibrations side by side: two or more run folders, of sessions, machines or methods.
 
-    The first RUN is the reference of the others. Where the data are independent, whether the
-    machine has changed is tested in what both data sets determine, and the parameter or limb that
-    explains the change is named. If nothing has changed, a change is reported in 5 % of cases, for
-    all runs together. Runs that share measurements are compared without a test.
+    The first RUN is the reference of the others. For independent data, a test shows whether the
+    machine has changed, and names the parameter or limb that explains it. The false-alarm rate is 5
+    % for all runs together. Runs that share measurements are compared without a test.
 
-    Runs whose parameters do not mean the same are refused: other mechanisms, free parameters, or
-    fixed values.
+    All runs must have one mechanism, with equal free parameters and fixed values.
 
     Examples:
       loopcal compare may june
@@ -394,12 +390,12 @@ def repeatability(
     data: tuple[Path, ...] = opt.data(),
     allowed: dict[str, bool] = opt.ALLOWED,
 ) -> Output:
-    """Compute pose accuracy (AP) and repeatability (RP) by ISO 9283 from DATA, in which each pose
-    of ROBOT, a run folder or a robot file, was visited several times.
+    """Compute pose accuracy (AP) and repeatability (RP) by ISO 9283 from several visits of each
+    pose in DATA. ROBOT is a run folder or a robot file.
 
-    Each visit is a row with a name of its own; visits of one pose have the same readings, or the
-    same commanded coordinates. The geometry of ROBOT is that of the controller. Visits from several
-    directions have the direction in the column group.
+    Each visit is a row with a separate name. Visits of one pose have equal readings, or equal
+    commanded coordinates. ROBOT has the geometry of the controller. Visits from several directions
+    have the direction in the column group.
 
     Examples:
       loopcal repeatability robot.yaml visits.csv
@@ -418,16 +414,16 @@ def repeatability(
 def report(
     run: Path = opt.RUN,
     output: Path = opt.path(
-        "HTML file to write; its name ends in .html. The same content is written as JSON beside "
-        "it. Default: report.html.",
+        "HTML file to write, with a name in .html. A JSON file with equal content is written next "
+        "to it. Default: report.html.",
         "-o",
         default=Path("report.html"),
     ),
     pdf: bool = opt.flag(
-        "Also print the report to a PDF file beside it, by an installed Chromium."
+        "Also print the report to a PDF file next to it, by an installed Chromium."
     ),
     facts: Path | None = opt.path(
-        "What to state beside the results: customer, serial number, ... `loopcal new "
+        "Facts to print with the results: customer, serial number, ... `loopcal new "
         "--report-facts` writes a file to fill in."
     ),
     force: bool = opt.force("the output files"),
@@ -439,7 +435,7 @@ def report(
     uncertainty budget and parameters follow, then what the data do not determine, residuals, values
     for the controller, and provenance.
 
-    The exit code is 2 where the calibration failed; the report is written and says so.
+    If the calibration failed, the report says so and the exit code is 2.
 
     Examples:
       loopcal report run
@@ -474,14 +470,14 @@ def regularize(
         type=opt.Count("FOLDS", 2),
     ),
     drop: tuple[str, ...] = opt.option(
-        "Exclude this pose. May be given several times.", multiple=True, metavar="POSE"
+        "Exclude this pose. Repeatable.", multiple=True, metavar="POSE"
     ),
     seed: int = opt.seed("the folds", REGULARIZATION),
     force: bool = opt.force("the folder"),
     allowed: dict[str, bool] = opt.ALLOWED,
 ) -> Output:
-    """Show how the error at held-out poses depends on the ridge parameter lam and on the number k
-    of directions of truncated SVD, for your own DATA, and which values the rules choose.
+    """Show how the error at held-out poses of DATA depends on the ridge parameter lam and on the
+    number k of directions of truncated SVD, with the values that the rules choose.
 
     Use a chosen value with loopcal calibrate --method ridge --lam, or --method truncated-svd
     --keep.

@@ -41,7 +41,7 @@ def gcode(
         metavar="SECONDS",
     ),
     unit: Literal["mm", "in"] | None = opt.option(
-        "Unit of lengths in the program.  [default: that of ROBOT, or mm]",
+        "Unit of lengths in the program.  [default: unit of ROBOT, or mm]",
         type=click.Choice(("mm", "in")),
     ),
     output: Path = opt.path("Program to write, such as poses.ngc.", "-o", required=True),
@@ -49,7 +49,7 @@ def gcode(
 ) -> Output:
     """Write G-code that moves ROBOT to the poses of PLAN, a folder or its plan.csv, in order.
 
-    The program starts at home, waits at each pose, passes home where the plan does, and returns to
+    The program starts at home, waits at each pose, passes home as the plan does, and returns to
     home. X Y Z A B C are machine coordinates (G53) of the platform. Each straight path is checked
     for strokes, joint limits and singularities.
 
@@ -83,19 +83,19 @@ def fill(
     exports: tuple[Path, ...] = opt.argument("EXPORT...", type=opt.FILE, nargs=-1, required=True),
     profile: str = opt.profile("How to read EXPORT.", required=True),
     unit: str | None = opt.option(
-        "Unit of lengths in EXPORT.  [default: as the profile states]",
+        "Unit of lengths in EXPORT.  [default: from the profile]",
         type=click.Choice(list_symbols(Dimension.LENGTH)),
     ),
     decimal: str | None = opt.DECIMAL,
     by_order: bool = opt.flag(
-        "Ignore names: EXPORT has the points of all targets of the first pose, then those of the "
+        "Ignore names: EXPORT has the points of all targets of the first pose, then of the "
         "second, and so on."
     ),
     one_session: bool = opt.flag(
-        "Several EXPORTs: the instrument was not moved between them. Otherwise each is a session."
+        "Several EXPORTs: the instrument stayed in place between them. Otherwise each is a session."
     ),
     allow_implausible: bool = opt.flag(
-        "Accept points that are not where the robot is expected, or in another unit."
+        "Accept points far from the expected place, or in another unit."
     ),
     output: Path = opt.path("Measurement file to write.", "-o", required=True),
     force: bool = opt.force("the output file"),
@@ -103,8 +103,8 @@ def fill(
     """Fill in SHEET, the measurements.csv of a plan of ROBOT, with the points of an instrument's
     EXPORT.
 
-    Points are joined by their names: POSE_TARGET, such as 12_SMR1. Missing, unknown and repeated
-    points are listed. Points that lie where others are expected are refused.
+    Points have names POSE_TARGET, such as 12_SMR1. The command lists missing, unknown and repeated
+    points, and refuses points at the place of others.
 
     Examples:
       loopcal fill hexapod.yaml plan/measurements.csv points.txt --profile spatial-analyzer \\
@@ -171,7 +171,7 @@ def convert_instrument_export(
     names = (option.name or "" for option in click.get_current_context().command.params)
     opt.refuse_given(
         (name for name in names if name not in used),
-        "with --profile, which states how the file is read",
+        "with --profile, which defines how to read the file",
     )
     path = find_profile_file(profile)
     refuse_outputs((output,), (file, path), force)
@@ -186,7 +186,7 @@ def convert_instrument_export(
         "findings": converted.findings,
     }
     page = [
-        f"{output}: {converted.rows} rows; {converted.passed} lines skipped as the profile states",
+        f"{output}: {converted.rows} rows; {converted.passed} lines skipped by the profile",
         *(f"note: {with_hint(finding)}" for finding in converted.findings),
         *_note_misfits([(file, *misfit) for misfit in converted.misfits], f"; {output} lists them"),
     ]
@@ -194,7 +194,7 @@ def convert_instrument_export(
 
 
 CORRECTED_ALONE = (
-    "--corrected calibrates with the measurements in the file; state where to write them, such as "
+    "--corrected calibrates with the measurements in the file. Name a file for them, such as "
     "--data data.csv"
 )
 
@@ -233,19 +233,18 @@ SETTINGS: Any = opt.Group(
     sigma_tape=_sigma(
         "lengths measured by hand, which become prior knowledge: {sigma_tape}", "{tape} for lines"
     ),
-    sigma_anchor=_sigma("anchors that FILE states {sigma_anchor}", "none: they are first guesses"),
+    sigma_anchor=_sigma("anchors in FILE {sigma_anchor}", "none: they are first guesses"),
     length_unit=_setting(
-        "Unit of lengths {length_unit}; with --profile, in place of the one it states.",
+        "Unit of lengths {length_unit}. Replaces the unit of --profile.",
         "--unit",
         type=click.Choice(list_symbols(Dimension.LENGTH)),
     ),
     home_height=_setting("Height of the home pose {home_height}.", "--home-z", type=opt.LENGTH),
     closures=_setting(
-        "Loops that FILE closes {closures}; by default those in FILE with the ending .yaml.",
-        type=opt.FILE,
+        "Loops that FILE closes {closures}. Default: FILE with the ending .yaml.", type=opt.FILE
     ),
     platform=_setting(
-        "Link that is the platform {platform}; by default the one on a fixed joint.", metavar="LINK"
+        "Link that is the platform {platform}. Default: the one on a fixed joint.", metavar="LINK"
     ),
 )
 """How FILE is read."""
@@ -255,7 +254,7 @@ SETTINGS: Any = opt.Group(
 def import_(
     file: Path = opt.argument("FILE", type=opt.FILE),
     format_name: str | None = opt.option(
-        "Format of FILE; by default chosen by the ending of its name.",
+        "Format of FILE. Default: by the ending of its name.",
         "--format",
         type=opt.Words("loopcal.io.formats:FORMATS", property="read"),
     ),
@@ -264,13 +263,13 @@ def import_(
     ),
     decimal: str | None = opt.DECIMAL,
     output: Path = opt.path(
-        "Robot file to write, which names the robot; with --profile the measurement file.",
+        "Robot file to write, which names the robot. With --profile: the measurement file.",
         "-o",
         required=True,
     ),
     data: Path | None = opt.path("Also write the measurements that FILE or --probes contain."),
     probes: tuple[Path, ...] = _setting(
-        "What the firmware printed when it probed the bed: {probes}. May be given several times.",
+        "What the firmware printed when it probed the bed: {probes}. Repeatable.",
         type=opt.FILE,
         multiple=True,
         metavar="REPORT",
@@ -280,17 +279,16 @@ def import_(
     ),
     settings: dict[str, Any] = SETTINGS,
     force: bool = opt.force(
-        "an output file", ", and write --corrected even where the calibration failed"
+        "an output file", ", and write --corrected even if the calibration failed"
     ),
 ) -> Output:
-    """Read FILE, which another program wrote, as a robot file and, where it contains any,
-    measurements.
+    """Read FILE of another program as a robot file and, if it contains any, measurements.
 
-    With --profile, FILE is text that an instrument exported; it becomes a measurement file (see
+    With --profile, FILE is text that an instrument exported, and becomes a measurement file (see
     docs/exports.md).
 
-    With --corrected, the exit code is 2 where the calibration failed, as in loopcal calibrate. Then
-    the corrected file is not written without --force.
+    With --corrected, the exit code is 2 if the calibration failed, as in loopcal calibrate. Only
+    --force then writes the corrected file.
 
     Examples:
       loopcal import printer.cfg -o printer.yaml --data heights.csv
@@ -327,7 +325,7 @@ def import_(
     source = choose_format(file, format_name)
     if source.read is None:
         raise DataError(
-            f"loopcal writes the format {source.name}, but cannot read it; it reads "
+            f"loopcal writes the format {source.name}, but cannot read it. It reads "
             f"{', '.join(list_formats('read'))}, and an instrument's export with a profile "
             "(--profile, docs/exports.md)"
         )
@@ -341,7 +339,7 @@ def import_(
     for key in stated:
         if key not in source.read_options:
             raise DataError(
-                f"{opt.name_option(key)} does not belong to the format {source.name}; leave it out"
+                f"{opt.name_option(key)} does not belong to the format {source.name}. Leave it out"
             )
     imported = source.read(file, ImportOptions(make_name(output.stem), **stated))
     report, changes, failures = None, [], []
@@ -402,26 +400,25 @@ def _view_import(
     if document["corrected"] is None:
         files = document["robot"], document["data"] or "DATA"
         return [*page, suggest_command("calibrate", *files, "-o", "run")]
-    return [*page, f"Written to {document['corrected']}; the rest of the file is unchanged"]
+    return [*page, f"Written to {document['corrected']}. The rest of the file is unchanged"]
 
 
 @opt.command()
 def export(
     source: str = opt.argument("RUN|ROBOT"),
     format_name: str | None = opt.option(
-        "Format to write; by default chosen by the ending of -o.",
+        "Format to write. Default: by the ending of -o.",
         "--format",
         type=opt.Words("loopcal.io.formats:FORMATS", property="write"),
     ),
     into: Path | None = opt.path(
-        "File of the controller to correct; everything else in it stays as it is.", metavar="FILE"
+        "File of the controller to correct. Everything else in it stays as it is.", metavar="FILE"
     ),
     output: Path | None = opt.path(
-        "File to write; without it, --format prints what to type, with sensible digits.", "-o"
+        "File to write. Without it, --format prints what to type, with sensible digits.", "-o"
     ),
     keep_frame: bool = opt.option(
-        "Write values of the same relative accuracy that leave programs where they are.",
-        is_flag=True,
+        "Write values of equal relative accuracy that leave programs in place.", is_flag=True
     ),
     force: bool = opt.force(
         "the output file", ", and write also the numbers of a calibration that failed"
@@ -429,10 +426,10 @@ def export(
 ) -> Output:
     """Write the parameters of RUN, or of a robot file, as another program reads them.
 
-    Without -o, the lines are printed for people: each identified value has three digits of its
-    uncertainty, and no more decimals than the controller keeps. Files have all digits. A note names
-    what the format cannot express. The exit code is 2 where the calibration of RUN
-    failed; then nothing is written without --force.
+    Without -o, the command prints lines to type: each identified value has three digits of its
+    uncertainty, and at most the decimals that the controller keeps. Files have all digits. A note
+    names what the format cannot express. If the calibration of RUN failed, the exit code is 2, and
+    only --force writes files.
 
     Examples:
       loopcal export run --format marlin
@@ -448,8 +445,8 @@ def export(
 
     if output is None and (format_name is None or into is not None):
         raise DataError(
-            "state the file to write with -o, such as -o parameters.csv; without it, --format "
-            "prints the lines of a controller, and --into is not possible"
+            "name the file to write with -o, such as -o parameters.csv. Without it, --format "
+            "prints the lines of a controller, and --into is impossible"
         )
     target = choose_format(output or Path(), format_name, is_written=True)
     refuse_outputs((output,), (Path(source),), force)  # the file of --into may be corrected

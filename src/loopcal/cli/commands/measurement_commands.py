@@ -23,14 +23,13 @@ if TYPE_CHECKING:
 def identifiability(
     robot: str = opt.ROBOT,
     data: tuple[Path, ...] = opt.data("[DATA]...", required=False),
-    poses: Path | None = opt.path("Instead of DATA: CSV file of poses that could be measured."),
+    poses: Path | None = opt.path("Instead of DATA: CSV file of possible poses."),
     draw: int = opt.DRAW,
     seed: int = opt.seed("the drawn poses", f"{opt.SIMULATION}:predict_noise_free"),
     at: tuple[tuple[str, float], ...] = opt.AT,
     unknown: dict[str, Any] = opt.UNKNOWN,
     reduced: bool = opt.flag(
-        "Also choose a smallest set of parameters, and show what the others are merged into.",
-        "--reduce",
+        "Also choose a smallest set of parameters, and show how it contains the others.", "--reduce"
     ),
     output: Path | None = opt.path(
         "With --reduce: robot file to write, with the other parameters fixed.", "-o"
@@ -45,7 +44,7 @@ def identifiability(
         metavar="QUANTITY",
     ),
     useful_angle: float | None = opt.option(
-        "The same for angles. Default: the length over the size of ROBOT.",
+        "Useful accuracy of angles. Default: the length over the size of ROBOT.",
         type=opt.POSITIVE_ANGLE,
         metavar="QUANTITY",
     ),
@@ -55,9 +54,9 @@ def identifiability(
     """Show which parameters of ROBOT the measurements DATA determine, which combinations they
     cannot determine, and which further measurement does.
 
-    Without DATA, an instrument is assumed that measures --poses, or poses drawn from the workspace
-    of ROBOT. Its options are --measure (or --kind, --components, --orientation), --frames and the
-    sigmas. With DATA they are those of the file.
+    Without DATA, loopcal assumes an instrument that measures --poses, or poses drawn from the
+    workspace of ROBOT. Its options are --measure (or --kind, --components, --orientation), --frames
+    and the sigmas. With DATA they come from the file.
 
     Examples:
       loopcal identifiability hexapod-42 measurements.csv
@@ -76,14 +75,14 @@ def identifiability(
 
     if data:
         if poses is not None:
-            raise DataError("DATA and --poses exclude each other; give one of the two")
-        sentence = "DATA states {reason}; leave out {option}, or DATA"
-        opt.refuse_given(opt.UNKNOWN.members, "what is measured and what is unknown", sentence)
+            raise DataError("DATA and --poses exclude each other. Give one of the two")
+        sentence = "DATA defines {reason}. Leave out {option}, or DATA"
+        opt.refuse_given(opt.UNKNOWN.members, "the instrument and its unknowns", sentence)
         opt.refuse_given(("sigma_reading",), "the noise of its readings (reading_noise)", sentence)
     if output is not None and not reduced:
-        raise DataError("-o writes the robot of --reduce; add --reduce, or leave out -o")
+        raise DataError("-o writes the robot of --reduce. Add --reduce, or leave out -o")
     if useful is None and useful_angle is not None:
-        raise DataError("--useful-angle belongs to --useful; add --useful, such as --useful 1um")
+        raise DataError("--useful-angle belongs to --useful. Add --useful, such as --useful 1um")
     machine, drawn = opt.open_robot(robot, (output,), (*data, poses), force), []
     machine = machine.with_conditions(dict(at))
     if data:
@@ -139,11 +138,11 @@ def _name_drawn_poses(robot: lc.Mechanism, count: int) -> str:
 def simulate(
     robot: str = opt.ROBOT,
     poses: Path | None = opt.path(
-        "CSV file of commanded poses, one column per coordinate. Their names are kept."
+        "CSV file of commanded poses, one column per coordinate. They keep their names."
     ),
     draw: int = opt.DRAW,
     fill: Path | None = opt.path(
-        "Instead of poses and instrument: data file of a plan, to be filled in.", metavar="SHEET"
+        "Instead of poses and instrument: data file of a plan to fill in.", metavar="SHEET"
     ),
     output: Path = opt.path("Measurement file to write.", "-o", required=True),
     at: tuple[tuple[str, float], ...] = opt.AT,
@@ -161,11 +160,11 @@ def simulate(
     """Command ROBOT to poses by its nominal geometry, and write what an instrument measures of the
     true machine.
 
-    Without --poses, the poses are drawn evenly from the workspace of ROBOT. The true machine has
-    the identified values of ROBOT, or drawn ones with --draw-errors.
+    Default of --poses: drawn evenly from the workspace of ROBOT. The true machine has the
+    identified values of ROBOT, or drawn ones with --draw-errors.
 
-    Targets that are fixed to the base (`of: base` in the settings of a file) are measured with
-    --fill only: name the sheet that `loopcal plan --like` wrote from such a file.
+    Targets on the base (`of: base` in the settings of a file) need --fill: name the sheet that
+    `loopcal plan --like` wrote from such a file.
 
     Examples:
       loopcal simulate hexapod-42 --draw-errors --truth truth.yaml -o measurements.csv
@@ -227,7 +226,7 @@ def _fill_in(
 
     others = ("poses", "draw", "distribution", "sigma_reading", "skip_unreachable")
     opt.refuse_given(
-        (*others, *opt.INSTRUMENT.members), f"because --fill {sheet} states poses and instrument"
+        (*others, *opt.INSTRUMENT.members), f"because --fill {sheet} defines poses and instrument"
     )
     instrument = measurement_file.load_instrument(sheet, robot)
     how = {"draw_errors": draw_errors, "seed": seed}

@@ -36,16 +36,16 @@ def reproduce(
         "Number of trials behind each statistical number.", of=RUN, type=opt.Count("TRIALS")
     ),
     robot: str | None = opt.option(
-        "Robot, or its file, in place of those of the paper.", metavar="ROBOT"
+        "Robot, or its file, in place of the paper's robot.", metavar="ROBOT"
     ),
     epsilon: float | None = opt.EPSILON,
     force: bool = opt.flag("Replace an earlier result in FOLDER."),
 ) -> Output:
-    """Repeat the study PAPER; without PAPER, list the studies.
+    """Repeat the study PAPER. Without PAPER, list the studies.
 
-    Every number called computed comes from this run. Statements of the paper that it does not
-    confirm are listed with the reason. With --robot the study is that of another robot; sizes that
-    it replaces are stated first.
+    Every number called computed comes from this run. The output lists unconfirmed statements of the
+    paper with the reason. With --robot, the study is for another robot, and the output begins with
+    the replaced sizes.
 
     Examples:
       loopcal reproduce
@@ -58,8 +58,7 @@ def reproduce(
 
     if paper is None:
         opt.refuse_given(
-            ("output", "seed", "trials", "robot", "epsilon", "force"),
-            "without the name of a study, which is repeated",
+            ("output", "seed", "trials", "robot", "epsilon", "force"), "without the name of a study"
         )
         rows = [{"name": p.name, "title": p.title, "source": p.source} for p in PAPERS.values()]
         lines = [
@@ -103,8 +102,8 @@ def per_leg(
 ) -> Output:
     """Identify the hexapod ROBOT leg by leg from full poses DATA, as the study hexapod-42 does.
 
-    All equations have weight one, and the noise that the legs share is ignored. The result has no
-    uncertainties and larger errors than that of calibrate; this command is for comparisons.
+    All equations have weight one, without the noise that the legs share. The result lacks
+    uncertainties and has larger errors than a calibration: the command is for comparisons.
 
     Examples:
       loopcal per-leg hexapod-42 measurements.csv

@@ -23,15 +23,15 @@ OPTIONS = "loopcal.planning.constraints:PlanOptions"
 POSES = "loopcal.planning.constraints:N_POSES"
 SURFACES = "loopcal.planning.plane_line_planning:SurfaceOptions"
 
-_COUNTED = "which is counted by --groups and --points"
-_HELD = "where a measuring machine holds x, y or z to --sigma-position"
+_COUNTED = "whose size is --groups and --points"
+_HELD = "because a measuring machine holds x, y or z to --sigma-position"
 _CHOSEN = "which moves points within the workspace and chooses by criterion D"
 EXCLUDED_BY_PLANE_LINE = {
     **dict.fromkeys(("poses", "accuracy", "curve"), _COUNTED),
     **dict.fromkeys(("like", "kinds", "components", "orientation", "sigma_angle"), _HELD),
     **dict.fromkeys(("criterion", "n_candidates", "allowed"), _CHOSEN),
-    "hold_out": "where every point is fitted",
-    "share": "which states no error over the workspace",
+    "hold_out": "because it fits every point",
+    "share": "which gives no error over the workspace",
     "measured": "which plans without earlier measurements",
     "unknown_frames": "whose surfaces are unknown in every group",
     "targets": "which checks the tool",
@@ -80,10 +80,10 @@ def plan(
         type=opt.Count("POINTS"),
     ),
     allowed: Path | None = opt.path(
-        "Poses to choose from; by default drawn from the workspace.", metavar="CSV"
+        "Poses to choose from. Default: drawn from the workspace.", metavar="CSV"
     ),
     measured: tuple[Path, ...] = opt.data_option(
-        "Measurements that exist already. May be given several times.", multiple=True
+        "Measurements that exist already. Repeatable.", multiple=True
     ),
     at: tuple[tuple[str, float], ...] = opt.AT,
     constraints: lc.Constraints = opt.CONSTRAINTS,
@@ -103,9 +103,9 @@ def plan(
     """Plan which poses of ROBOT to measure with an instrument. Write a folder with a sheet for the
     measurement and a data file to fill in.
 
-    The instrument is described by --measure (or --kind, --components, --orientation), --frames and
-    the sigmas, or by a measurement file with --like. Strokes, joint limits and cones of ROBOT are
-    always respected, also on the path between poses.
+    Options for the instrument: --measure (or --kind, --components, --orientation), --frames and the
+    sigmas, or a measurement file with --like. Poses and paths between them always keep strokes,
+    joint limits and cones of ROBOT.
 
     Examples:
       loopcal plan hexapod-42 -o plan --poses 30 --sigma-position 5um --sigma-angle 10urad
@@ -129,7 +129,7 @@ def plan(
     if unknown["measure"] == (PLANE_LINE,):
         for name, reason in EXCLUDED_BY_PLANE_LINE.items():
             sentence = (
-                "{option} cannot be combined with --measure plane-line, {reason}; leave it out"
+                "{option} cannot be combined with --measure plane-line, {reason}. Leave it out"
             )
             opt.refuse_given((name,), reason, sentence)
         sigma = instrument["sigma_position"]
@@ -138,21 +138,21 @@ def plan(
             result = lc.plan_surfaces(machine, surface_options, progress)
     else:
         if opt.is_given("groups") or opt.is_given("points"):
-            raise DataError("--groups and --points belong to --measure plane-line; leave them out")
+            raise DataError("--groups and --points belong to --measure plane-line. Leave them out")
         if like is None:
             measuring = opt.make_instrument(unknown | instrument, machine)
         else:
             described = (*opt.UNKNOWN.members, *opt.INSTRUMENT.members)
-            sentence = "{reason} describes the instrument; leave out {option}, or --like"
+            sentence = "{reason} describes the instrument. Leave out {option}, or --like"
             opt.refuse_given(described, f"--like {like}", sentence)
             measuring = load_instrument_to_plan(like, machine)
         if accuracy is not None and poses is not None:
             raise DataError(
-                "--poses and --accuracy exclude each other; give the number of poses, or the error "
+                "--poses and --accuracy exclude each other. Give the number of poses, or the error "
                 "to reach"
             )
         if accuracy is not None and curve:
-            raise DataError("--accuracy shows its own curve; leave out --curve")
+            raise DataError("--accuracy shows its own curve. Leave out --curve")
         goal, target = accuracy or (None, "pose")
         earlier = _read_measured(measured, machine) if measured else None
         plan_options = lc.PlanOptions(
@@ -193,10 +193,10 @@ def _read_measured(paths: tuple[Path, ...], robot: lc.Mechanism) -> lc.Measureme
     files = " ".join(map(str, paths))
     if not earlier.n_rows:
         raise DataError(
-            f"--measured {files} contains no measured value; fill it in, or leave it out"
+            f"--measured {files} contains no measured value. Fill it in, or leave it out"
         )
     if earlier.is_held_out.all():
-        raise DataError(f"--measured {files} holds all its poses out; leave some to fit")
+        raise DataError(f"--measured {files} holds all its poses out. Leave some to fit")
     return earlier
 
 

@@ -30,11 +30,11 @@ SCHEMAS = {
 @opt.command()
 def new(
     family: str | None = opt.argument("[FAMILY]", required=False),
-    output: Path | None = opt.path("Robot file to write; the robot gets its name.", "-o"),
+    output: Path | None = opt.path("Robot file to write, which names the robot.", "-o"),
     measurements: Path | None = opt.path("Also write a measurement file with columns but no rows."),
     report_facts: Path | None = opt.path(
-        "Write a file to fill in with what reports and certificates state beside the results, such "
-        "as customer and serial number. Needs no FAMILY."
+        "Write a file to fill in with facts for reports and certificates, such as customer and "
+        "serial number. Needs no FAMILY."
     ),
     unknown: dict[str, Any] = opt.UNKNOWN,
     instrument: dict[str, Any] = opt.INSTRUMENT,
@@ -84,7 +84,7 @@ def new(
             page.append(f"{measurements}: columns without rows. Fill in your measurements.")
             page.append(suggest_command("calibrate", output, measurements, "-o", "run"))
     elif family or output or measurements or report_facts is None:
-        raise DataError("a new robot file needs FAMILY and -o; give both")
+        raise DataError("a new robot file needs FAMILY and -o. Give both")
     if report_facts is not None:
         texts[report_facts] = TEMPLATE
         page.append(f"{report_facts}: facts for reports and certificates. Fill in what you know.")
@@ -99,14 +99,14 @@ def new(
 @opt.command()
 def schema(
     file: str = opt.argument("KIND", type=click.Choice(list(SCHEMAS))),
-    output: Path | None = opt.path("File to write; by default the schema is printed.", "-o"),
+    output: Path | None = opt.path("File to write. Without it the schema is printed.", "-o"),
     force: bool = opt.force("the file"),
 ) -> Output:
     """Print the JSON Schema of a kind of file: robot, settings (of a measurement file), profile or
     study.
 
-    An editor that knows it completes keys, shows their meaning and marks mistakes. It is found by
-    the first line of a file that `loopcal new` writes.
+    An editor with the schema completes keys, shows their meaning and marks mistakes. The first line
+    of a file from `loopcal new` names it.
 
     Examples:
       loopcal schema robot -o robot.schema.json
@@ -135,7 +135,7 @@ def check(
     """Read ROBOT, a robot file or the name of a shipped robot, and show its actuators and
     parameters.
 
-    An error in the file is reported with its line: units, joints, dimensions, mobility.
+    Errors in the file (units, joints, dimensions, mobility) have a line number.
 
     Examples:
       loopcal check hexapod-42
@@ -168,19 +168,17 @@ def check(
 @opt.command()
 def view(
     source: str = opt.argument("RUN|ROBOT", shell_complete=opt.complete_robot),
-    output: Path = opt.path(
-        "HTML file to write; its name ends in .html.", "-o", default="view.html"
-    ),
+    output: Path = opt.path("HTML file to write, with a name in .html.", "-o", default="view.html"),
     no_browser: bool = opt.flag("Do not open the view in the browser."),
     force: bool = opt.force("the output file"),
 ) -> Output:
     """Show RUN, a run folder, or a robot file as an interactive 3-D view in the browser.
 
-    The view is one HTML file that needs no network. It shows the robot at home; of a run also at
-    the measured poses, with the position errors before calibration and the uncertainty over the
-    workspace.
+    The view is one HTML file that needs no network. It shows the robot at home. For a run, it also
+    shows the measured poses, with the position errors before calibration and the uncertainty over
+    the workspace.
 
-    The exit code is 2 where the calibration of RUN failed; the view is written and says so.
+    If the calibration of RUN failed, the view says so and the exit code is 2.
 
     Examples:
       loopcal view hexapod-42
@@ -198,7 +196,7 @@ def view(
         save_view(run if run.result else run.robot, output)
     is_open = not no_browser and open_page(output.resolve().as_uri())
     failures = [] if run.failure is None else [run.failure]
-    unopened = "" if is_open or no_browser else "; no browser could be started here"
+    unopened = "" if is_open or no_browser else ", but no browser starts here"
     document = {"output": output, "opened": is_open, "reasons": failures}
     return Output(document, lambda: [f"Written to {output}{unopened}"], failures)
 
@@ -206,11 +204,9 @@ def view(
 @opt.command()
 def example(
     name: str | None = opt.argument("[NAME]", required=False),
-    output: Path | None = opt.path(
-        "Folder to make; by default one with the name of the example.", "-o"
-    ),
+    output: Path | None = opt.path("Folder to make. Default: the name of the example.", "-o"),
 ) -> Output:
-    """Write the files of an example into a new folder; without NAME, list the examples.
+    """Write the files of an example into a new folder. Without NAME, list the examples.
 
     Examples:
       loopcal example
@@ -223,7 +219,7 @@ def example(
     if name is None:
         titles = {name: describe_example(folder) for name, folder in list_examples().items()}
         columns = (word_column("example"), word_column("content", wraps=True))
-        table = Table("Examples; loopcal example NAME writes one", columns, tuple(titles.items()))
+        table = Table("Examples: loopcal example NAME writes one", columns, tuple(titles.items()))
         return Output({"examples": titles}, lambda: [table])
     folder = Path(name) if output is None else output
     files = write_example(name, folder)

@@ -46,8 +46,8 @@ def load_fit(
     else:
         if Path(source).is_file():
             raise LoopcalError(
-                f"{source}: this is a file; give a run folder, or the files of measurements after "
-                "that of the robot"
+                f"{source}: this is a file. Give a run folder, or a robot file and then files of "
+                "measurements"
             )
         opt.refuse_given(FIT_NAMES, "with a run folder")
         run = lc.load_run(source)
@@ -70,12 +70,12 @@ def bootstrap(
         type=opt.Words(f"{BOOTSTRAP}:Scheme"),
     ),
     unit: str | None = opt.option(
-        "What is resampled together: pose, block, session, day, or a number of consecutive "
-        "poses.  [default: the largest unit with at least 12 blocks]",
+        "Unit of resampling: pose, block, session, day, or a number of consecutive poses.  "
+        "[default: the largest unit with at least 12 blocks]",
         metavar="UNIT",
     ),
     kind: Any = opt.option(
-        "How intervals are read from the resamples.",
+        "Kind of the bootstrap intervals.",
         "--interval",
         of=f"{BOOTSTRAP}:Bootstrap.intervals",
         type=opt.Words(f"{BOOTSTRAP}:IntervalKind"),
@@ -88,10 +88,10 @@ def bootstrap(
     allowed: dict[str, bool] = opt.ALLOWED,
 ) -> Output:
     """Resample a calibration by blocks of poses, fit every resample, and compare the scatter with
-    the stated intervals.
+    the intervals of the fit.
 
-    RUN is a run folder, whose fit is repeated from its files. Or give a ROBOT and DATA, and the
-    options of the fit.
+    RUN is a run folder, and the command repeats its fit. Or give a ROBOT and DATA, and the options
+    of the fit.
 
     Examples:
       loopcal bootstrap run
@@ -123,19 +123,18 @@ def sample(
         type=opt.Count("DRAWS", 100),
     ),
     region: bool = opt.flag(
-        "Instead of drawing, show linear intervals that hold for several parameters at once; "
-        "of parameters that -p selects, also their joint region."
+        "Instead of drawing, show linear intervals that hold for several parameters at once, and "
+        "the joint region of parameters selected by -p."
     ),
     names: tuple[str, ...] = opt.option(
-        "Parameter for --region, or a pattern such as 'leg1.*'. May be given several times.  "
-        "[default: all]",
+        "Parameter for --region, or a pattern such as 'leg1.*'. Repeatable.  [default: all]",
         "-p",
         "--parameter",
         multiple=True,
         metavar="NAME",
     ),
     rule: Any = opt.option(
-        "How --region makes intervals that hold together; maximum gives the narrowest.",
+        "How --region makes intervals that hold together. maximum gives the narrowest.",
         of="loopcal.diagnose.intervals:compute_simultaneous_intervals",
         type=opt.Words("loopcal.diagnose.intervals:Rule"),
     ),
@@ -149,8 +148,8 @@ def sample(
     """Draw parameters from the exact posterior of a calibration, and compare its intervals with the
     linear ones. With --region, show intervals that hold for all selected parameters at once.
 
-    RUN is a run folder, whose fit is repeated from its files. Or give a ROBOT and DATA, and the
-    options of the fit.
+    RUN is a run folder, and the command repeats its fit. Or give a ROBOT and DATA, and the options
+    of the fit.
 
     Examples:
       loopcal sample run

@@ -37,7 +37,7 @@ def _parse_share(text: str) -> Share:
 
     match = re.fullmatch(r"([1-9]\d{0,8})/([1-9]\d{0,8})", text)
     if match is None or int(match[1]) > int(match[2]):
-        raise StudyError(f"{text!r} is not a share; write 3/10 for the third of ten parts")
+        raise StudyError(f"{text!r} is not a share. Write 3/10 for the third of ten parts")
     return Share(int(match[1]), int(match[2]))
 
 
@@ -64,10 +64,10 @@ WORK: Any = opt.Group(
         "Processes that compute.  [default: the number of processors]", type=opt.Count("WORKERS", 1)
     ),
     dask=opt.option("Use a dask cluster, by the address of its scheduler.", metavar="ADDRESS"),
-    ray=opt.flag("Use the ray cluster of the variable RAY_ADDRESS, or one that is started here."),
+    ray=opt.flag("Use the ray cluster of the variable RAY_ADDRESS, or start one here."),
     share=opt.option(
-        "Compute a share only, such as 3/10 for the third of ten jobs; join their folders "
-        "with merge.",
+        "Compute a share only, such as 3/10 for the third of ten jobs. Join their folders with "
+        "merge.",
         "--cells",
         type=opt.Parsed("part", _parse_share),
         metavar="PART/PARTS",
@@ -133,7 +133,7 @@ def study() -> None:
 def new(
     study_file: Path = STUDY,
     robot: str | None = opt.option(
-        "A robot, or its file.  [default: linear-delta, or that of PAPER]", metavar="ROBOT"
+        "A robot, or its file.  [default: linear-delta, or the robot of PAPER]", metavar="ROBOT"
     ),
     paper: str | None = opt.option(
         "Write the study of a paper that reproduce repeats.", metavar="PAPER"
@@ -143,7 +143,7 @@ def new(
     """Write a study file to fill in, with a comment for each setting.
 
     With --paper, write the study of a paper: its errors, noises and methods. --robot replaces its
-    robot; the command states which sizes that replaces, too.
+    robot, and the command lists the sizes that change with it.
 
     Examples:
       loopcal study new study.yaml
@@ -198,14 +198,14 @@ def run(
     folder: Path = opt.path("Folder to make.", "-o", "--output", required=True, metavar="FOLDER"),
     work: tuple[Executor, Share] = WORK,
     resume: bool = opt.flag(
-        "Continue FOLDER where it exists. STUDY may have more replicates or levels than before."
+        "Continue FOLDER if it exists. STUDY may have more replicates or levels than before."
     ),
     quick: bool = QUICK,
 ) -> Output:
     """Compute STUDY, and store its trials in FOLDER.
 
-    Every block of trials is stored when it is finished. A study that is stopped, by Ctrl-C or in
-    any other way, loses only the blocks in work; --resume continues it.
+    FOLDER gets every block of trials when it is complete. A stopped study only loses the blocks in
+    work. --resume continues it.
 
     Examples:
       loopcal study run study.yaml -o results
@@ -229,7 +229,7 @@ def extend(
     ),
     work: tuple[Executor, Share] = WORK,
 ) -> Output:
-    """Compute further trials of each cell of a study, until there are N; finished ones are kept.
+    """Compute further trials of each cell of a study, until there are N. Finished ones stay.
 
     Examples:
       loopcal study extend results --replicates 5000
@@ -242,7 +242,7 @@ def extend(
 
 @opt.command(of=study)
 def status(folder: Path = FOLDER) -> Output:
-    """Show how much of a study is stored, also while it runs.
+    """Show the progress of a study, also while it runs.
 
     Examples:
       loopcal study status results
@@ -257,7 +257,7 @@ def status(folder: Path = FOLDER) -> Output:
 def summary(
     folder: Path = FOLDER,
     scores: tuple[str, ...] = opt.option(
-        "Score to show; may be repeated.", "--score", multiple=True, metavar="NAME"
+        "Score to show. Repeatable.", "--score", multiple=True, metavar="NAME"
     ),
     against: str | None = opt.option(
         "Factor along the axis of figures, such as poses.", metavar="FACTOR"
@@ -311,8 +311,8 @@ def ask(
 ) -> Output:
     """Find the smallest or largest level of a factor that reaches a limit on a share of machines.
 
-    The answer says which levels reach it for certain, and which may. Run more replicates where it
-    is not certain, see loopcal study extend.
+    The answer says which levels reach it for certain, and which may. For uncertain levels, run more
+    replicates with loopcal study extend.
 
     Examples:
       loopcal study ask results --smallest poses --limit 10um
@@ -389,8 +389,8 @@ def replay(
 ) -> Output:
     """Repeat one trial of a study as a normal calibration, with all its checks and a run folder.
 
-    Cells and trials count from 0; status lists the cells. A second folder beside the run folder,
-    RUN-input, gets the robot file, the measurements and the true machine.
+    Cells and trials count from 0, as in study status. A second folder, RUN-input, gets the robot
+    file, the measurements and the true machine.
 
     Examples:
       loopcal study replay results 3/17 -o trial

@@ -72,10 +72,8 @@ def largest_changes(data: Data) -> str:
 def effect(data: Data, most: int = MOST_PARTS) -> str:
     """Return the effect of a merged parameter in terms of the kept ones, at most `most` of them."""
     if not data["into"]:
-        return "it has no effect on the measurements"
-    return (
-        f"1 {data['unit']} of it has the same effect as {_list_changes(data['into'], data, most)}"
-    )
+        return "it changes no measurement"
+    return f"1 {data['unit']} of it is equivalent to {_list_changes(data['into'], data, most)}"
 
 
 def _list_changes(names: Sequence[str], data: Data, most: int) -> str:
@@ -84,15 +82,15 @@ def _list_changes(names: Sequence[str], data: Data, most: int) -> str:
 
 
 def inflated_tolerances(data: Data) -> str:
-    """Return by which factors tolerances, or parts of them, are inflated."""
-    wide = "the tolerances of {names:list} {factor} times as wide as stated"
-    shift = "a common deviation of {names:list} ({factor} tolerances)"
+    """Return by which factors expected spreads, or parts of them, are inflated."""
+    wide = "the expected spreads of {names:list} {factor} times as wide"
+    shift = "a common deviation of {names:list} ({factor} expected spreads)"
     changes = [fill_template(shift if p["kind"] == "shift" else wide, **p) for p in data["parts"]]
     if data["factor"] > 1.0 or not changes:
-        others = "the others" if changes else "tolerances"
+        others = "the other spreads" if changes else "expected spreads"
         is_near_one = 1.0 < data["factor"] < 1.005  # it would read "1 times"
-        wider = "less than 0.5 % wider than" if is_near_one else "{factor} times as wide as"
-        changes.append(fill_template(f"{others} {wider} {data.get('source', 'stated')}", **data))
+        wider = "less than 0.5 % wider" if is_near_one else "{factor} times as wide"
+        changes.append(fill_template(f"{others} {wider}", **data))
     return list_names(changes, len(changes))
 
 
@@ -115,7 +113,7 @@ SOURCES = {
     "readings": "actuator readings",
     "setup": "set-up",
     "common": "common errors of the instrument",
-    "tolerances": "undetermined tolerances",
+    "tolerances": "undetermined parameters",
     "earlier": "earlier calibration",
     "repeatability": "repeatability",
     "discrepancy": "model discrepancy",

@@ -181,7 +181,7 @@ class Table:
             row = int(beyond[0])
             allowed = f"{LARGEST / factor:g} [{self.units[name]}]"
             sentence = f"column {name!r} is {self.text(name)[row]}, beyond {allowed}"
-            raise self.row_error(row, f"{sentence}; correct the number or the unit")
+            raise self.row_error(row, f"{sentence}. Correct the number or the unit")
         return values
 
     def scaled_numbers(
@@ -202,7 +202,7 @@ class Table:
         symbol = self.units[name] if symbol is None else symbol
         if symbol is None:
             example = f"{name} [{'mm' if dimension is Dimension.LENGTH else 'deg'}]"
-            sentence = f"column {name!r} has no unit; write it in brackets, such as {example!r}"
+            sentence = f"column {name!r} has no unit. Write it in brackets, such as {example!r}"
             raise self.header_error(sentence)
         try:
             return find_unit(symbol, dimension).factor_to_si
@@ -212,12 +212,12 @@ class Table:
     def _refuse_cell(self, name: str, row: int, cell: str) -> FileError:
         """Return why a cell is not a finite number."""
         if not cell:
-            return self.row_error(row, f"column {name!r} is empty, but required; write its value")
+            return self.row_error(row, f"column {name!r} is empty, but required. Write its value")
         if parse_number(cell) is None:
             sentence = f"column {name!r} is {quote(cell)}, but a number is needed"
             return self.row_error(row, f"{sentence}, such as 12.5 or 1e-3")
         sentence = f"column {name!r} is {quote(cell)}, which is not finite"
-        return self.row_error(row, f"{sentence}; leave the cell empty where nothing was measured")
+        return self.row_error(row, f"{sentence}. Leave the cell empty if nothing was measured")
 
     def header_error(self, sentence: str) -> FileError:
         """Return an error at the header line."""
@@ -242,7 +242,7 @@ def read_table(path: str | Path) -> Table:
     """
     table = read_template(path)
     if not len(table):
-        sentence = "this file has a header but no rows; add one row for each pose"
+        sentence = "this file has a header but no rows. Add one row for each pose"
         raise FileError(sentence, table.path, table.header_line)
     return table
 
@@ -268,7 +268,7 @@ def read_template(path: str | Path) -> Table:
     header_line, header = numbers[0], texts[0]
     if "," not in header and (";" in header or "\t" in header):
         separator = "semicolons" if ";" in header else "tabs"
-        sentence = f"columns are separated by {separator}; use commas, and decimal points"
+        sentence = f"columns are separated by {separator}. Use commas, and decimal points"
         raise FileError(sentence + CONVERT_HINT, path, header_line)
     units = _parse_header(path, header_line, header)
     cells: list[list[str]] = [[] for _ in units]
@@ -278,8 +278,8 @@ def read_template(path: str | Path) -> Table:
         for number, row in zip(numbers[part], rows, strict=True):
             if len(row) != len(units):
                 sentence = f"this row has {len(row)} cells, but the header has {len(units)} columns"
-                act = "write one cell for each column, empty where not measured, and decimal points"
-                raise FileError(f"{sentence}; {act}", path, number)
+                act = "Write one cell for each column, empty if not measured, with decimal points"
+                raise FileError(f"{sentence}. {act}", path, number)
         for column, of_chunk in zip(cells, zip(*rows, strict=True), strict=True):
             column.extend(of_chunk)
     columns = dict(zip(units, map(tuple, cells), strict=True))
@@ -299,7 +299,7 @@ def require_columns(table: Table, needed: Sequence[str], why: str) -> None:
         if name not in table.units:
             hints = (suggest_header(other, symbol, [name]) for other, symbol in table.units.items())
             hint = next(filter(None, hints), suggest_names(name, spare))
-            raise table.header_error(f"no column {name!r}{hint}, {why}; add it with its unit")
+            raise table.header_error(f"no column {name!r}{hint}, {why}. Add it with its unit")
 
 
 def suggest_header(header: str, symbol: str | None, known: Iterable[str]) -> str:
@@ -353,7 +353,7 @@ def _read_settings(path: Path, lines: Sequence[str]) -> tuple[YamlFile, int]:
     except FileError as error:
         if error.code is not None:
             raise
-        advice = "lines with # at the top are settings, '# key: value'; begin a remark with ##"
+        advice = "lines with # at the top are settings, '# key: value'. Begin a remark with ##"
         raise FileError(f"{error.sentence} ({advice})", path, error.line) from None
 
 
@@ -378,7 +378,7 @@ def _read_sidecar(path: Path, has_front_matter: bool) -> YamlFile | None:
     if not has_front_matter:
         return settings
     if any(key in settings.content for key in SIDECAR_KEYS):
-        sentence = f"settings are at the top of this file and in {beside.name}; remove one of them"
+        sentence = f"settings are at the top of this file and in {beside.name}. Remove one of them"
         raise FileError(f"{sentence} (a remark begins with ##)", path)
     return None
 
@@ -392,9 +392,9 @@ def _parse_header(path: Path, line: int, text: str) -> dict[str, str | None]:
         name = cell if match is None else match["name"]
         fault: str | Finding | None = find_fault(name, LONGEST_COMPOSED)
         if match is None:
-            fault = f"header of column {i + 1} is {quote(cell)}; write name and unit, as 'x [mm]'"
+            fault = f"header of column {i + 1} is {quote(cell)}. Write name and unit, as 'x [mm]'"
         elif fault is None and name in units:
-            fault = f"duplicate column {name!r}; remove one"
+            fault = f"duplicate column {name!r}. Remove one"
         if fault is not None:
             # by its form the header of a column: a known name, or with a unit
             is_ours = any(cell in NAME_COLUMNS or cell.endswith(("]", ")")) for cell in cells)
@@ -412,4 +412,4 @@ def _split_cells(path: Path, line: int, text: str) -> tuple[str, ...]:
     try:
         return tuple(cell.strip() for cell in next(csv.reader([text], strict=True)))
     except csv.Error as error:
-        raise FileError(f"not valid CSV ({error}); correct the quotes", path, line) from None
+        raise FileError(f"not valid CSV ({error}). Correct the quotes", path, line) from None

@@ -127,7 +127,7 @@ COMPOSED_LENGTH = FileLimit(
     "shorten it",
 )
 TEXT_LENGTH = FileLimit(
-    "length of a text that is no name", 10_000, "characters", "`source` of a robot", "shorten it"
+    "length of a text that is not a name", 10_000, "characters", "`source` of a robot", "shorten it"
 )
 TABLE_SIZE = FileLimit(
     "size of a measurement file",
@@ -148,7 +148,7 @@ TABLE_LINES = FileLimit(
     5_000_000,
     "lines",
     "blank lines and remarks included",
-    "remove what is no row, or divide it into several files",
+    "remove what is not a row, or divide it into several files",
 )
 TABLE_COLUMNS = FileLimit(
     "columns of a measurement file",

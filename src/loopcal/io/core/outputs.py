@@ -64,16 +64,16 @@ def refuse_outputs(
         folder = resolve_target(path).parent
         if any(_is_same_file(path, other) for other in read):
             raise FileError(
-                "this output is also an input of this command; choose another name", path
+                "this output is also an input of this command. Choose another name", path
             )
         if any(_is_same_file(path, other) for other in wanted[:i]):
-            raise FileError("two outputs have this name; choose another name for one of them", path)
+            raise FileError("two outputs have this name. Choose another name for one of them", path)
         if not folder.is_dir():
             raise FileError(
                 f"cannot write here: folder {folder} does not exist; create it first", path
             )
         if not os.access(folder, os.W_OK):
-            raise FileError("cannot write here (permission denied); choose another folder", path)
+            raise FileError("cannot write here (permission denied). Choose another folder", path)
         if path.is_file() and not force:
             raise FileError(report_finding("files.output-exists"), path)
         if is_folder_document(path):
@@ -170,13 +170,13 @@ def refuse_folder(path: Path, kind: FolderKind, force: bool, inputs: Sequence[Pa
         # what killed commands left beside a folder; one that was set aside is renamed back
         remove_leftovers(target, lambda folder: _is_own(folder, kind))
         if target.exists() and not target.is_dir():
-            sentence = f"this is a file, but the {kind.content} is a folder; choose another name"
+            sentence = f"this is a file, but the {kind.content} is a folder. Choose another name"
             raise FileError(sentence, path)
         _refuse_place(path, target)
         for file in inputs:
             if file.exists() and file.resolve().is_relative_to(target):
                 sentence = f"this folder contains the input {file} and cannot be replaced"
-                raise FileError(f"{sentence}; choose another name", path)
+                raise FileError(f"{sentence}. Choose another name", path)
         if target.is_dir() and any(target.iterdir()):
             if not force:
                 finding = report_finding("files.folder-in-use", content=kind.content)
@@ -185,7 +185,7 @@ def refuse_folder(path: Path, kind: FolderKind, force: bool, inputs: Sequence[Pa
             places = (place for place, _, _ in os.walk(target))  # gone where another command writes
             if any(os.path.lexists(p) and not os.access(p, os.W_OK | os.X_OK) for p in places):
                 sentence = "this folder is protected against changes, so it cannot be replaced"
-                raise FileError(f"{sentence}; choose another name, or permit writing in it", path)
+                raise FileError(f"{sentence}. Choose another name, or permit writing in it", path)
 
 
 def _refuse_place(path: Path, target: Path) -> None:
@@ -197,9 +197,9 @@ def _refuse_place(path: Path, target: Path) -> None:
         raise FileError(finding, path)
     parent = next(folder for folder in target.parents if folder.exists())
     if not parent.is_dir():
-        raise FileError(f"cannot write here: {parent} is not a folder; choose another place", path)
+        raise FileError(f"cannot write here: {parent} is not a folder. Choose another place", path)
     if not os.access(parent, os.W_OK | os.X_OK):
-        raise FileError("cannot write here (permission denied); choose another folder", path)
+        raise FileError("cannot write here (permission denied). Choose another folder", path)
 
 
 def _refuse_other_content(path: Path, kind: FolderKind) -> None:
@@ -268,7 +268,7 @@ def describe_leftover(path: Path, document: str) -> str:
     """Return a sentence on a folder that a killed command set aside; empty where there is none."""
     for folder in list_leftovers(resolve_links(path)):
         if (folder / document).is_file():
-            return f"an interrupted command left it as {folder}; rename this folder"
+            return f"an interrupted command left it as {folder}. Rename this folder"
     return ""
 
 

@@ -77,7 +77,7 @@ def read_units(file: YamlFile) -> dict[Dimension, Unit]:
     """
     if "units" not in file.content:
         example = "write for example 'units: {length: mm, angle: deg}'"
-        raise file.error(f"this file states no units, which every number needs; {example}")
+        raise file.error(f"this file has no units, which every number needs; {example}")
     record = read_record(file, file.content["units"], _make_units_record(), None, ("units",))
     stated = {Dimension(name): find_unit(symbol) for name, symbol in vars(record).items()}
     return {Dimension.RATIO: find_unit("1"), **stated}
@@ -159,8 +159,8 @@ class _RecordReader:
             members = arguments[:1] * len(items)
         elif len(items) != len(members):
             fact = f"{_name(at)} has {len(items)} values, but {len(members)} are needed"
-            act = "remove the others" if len(items) > len(members) else "add the missing ones"
-            raise _MisfitError(fact, f"; {act}", at)
+            act = "Remove the others" if len(items) > len(members) else "Add the missing ones"
+            raise _MisfitError(fact, f". {act}", at)
         pairs = enumerate(zip(members, items, strict=True))
         return [self.read(member, item, (*at, i), of) for i, (member, item) in pairs]
 
@@ -184,7 +184,7 @@ class _RecordReader:
             if stated in node and (stated != key or key not in renamed.values()):
                 values[field.name] = self.read(hints[key], node[stated], (*at, stated))
             elif field.default is absent and field.default_factory is absent:
-                raise _MisfitError(f"{_name(at)} has no key {key!r}", "; add it", at)
+                raise _MisfitError(f"{_name(at)} has no key {key!r}", ". Add it", at)
         try:
             return record(**values)
         except ValueError as error:  # what the record itself says of its values
@@ -264,7 +264,7 @@ def _read_literal(allowed: tuple[Any, ...], node: Any, at: Location) -> Any:
     hint = "" if str(node) in names else suggest_names(str(node), names)
     shown = quote(node) if isinstance(node, str) else _describe(node)
     constants = ", ".join(map(repr, allowed))
-    raise _MisfitError(f"{_name(at)} is {shown}{hint}; allowed: {constants}", "", at)
+    raise _MisfitError(f"{_name(at)} is {shown}{hint}. Allowed: {constants}", "", at)
 
 
 NEEDED: Mapping[type, tuple[tuple[type, ...], str, str]] = {
@@ -285,11 +285,11 @@ def _require(needed: Any, node: Any, at: Location) -> Any:
     if isinstance(node, allowed) and (needed is bool or not isinstance(node, bool)):
         return float(node) if needed is float else node
     if needed is int and isinstance(node, float):
-        act = "write it without a decimal point and without an exponent"
+        act = "Write it without a decimal point and without an exponent"
     if needed in (float, int) and isinstance(node, str) and node.strip()[:1] in "+-.0123456789":
-        act = "write the number without quotes and without a unit"
-        act = "write a decimal point, not a comma" if "," in node else act
-    raise _MisfitError(f"{_name(at)} is {_describe(node)}, but {words} is needed", f"; {act}", at)
+        act = "Write the number without quotes and without a unit"
+        act = "Write a decimal point, not a comma" if "," in node else act
+    raise _MisfitError(f"{_name(at)} is {_describe(node)}, but {words} is needed", f". {act}", at)
 
 
 def _name(location: Location) -> str:

@@ -45,13 +45,13 @@ def as_path(path: Any, what: str) -> Path:
         name = os.fsencode(path)
     except TypeError:
         given = type(path).__name__
-        sentence = f"the path of a {what} is of type {given}; give a text or a pathlib.Path"
+        sentence = f"the path of a {what} is of type {given}. Give a text or a pathlib.Path"
         raise DataError(f"{sentence} (the order of savers is save_..(object, path))") from None
     except UnicodeEncodeError:
         name = b"\0"
     if b"\0" in name:
         sentence = f"the path of a {what} contains a null character or half of a character"
-        raise DataError(f"{sentence}, which no file name can have; correct the path")
+        raise DataError(f"{sentence}, which no file name can have. Correct the path")
     return Path(path)
 
 
@@ -67,14 +67,14 @@ def read_text(path: str | Path, what: str, hint: str = "", limit: FileLimit = PR
     except UnicodeDecodeError as error:
         line = raw.count(b"\n", 0, error.start) + 1
         byte = f"byte 0x{raw[error.start]:02x}"
-        sentence = f"this {what} is not UTF-8 text ({byte}); save it as UTF-8{hint}"
+        sentence = f"this {what} is not UTF-8 text ({byte}). Save it as UTF-8{hint}"
         raise FileError(sentence, path, line) from None
     if "\0" in text:
         line = text.count("\n", 0, text.index("\0")) + 1
-        sentence = f"this {what} contains a zero byte and is not UTF-8 text; save it as UTF-8{hint}"
+        sentence = f"this {what} contains a zero byte and is not UTF-8 text. Save it as UTF-8{hint}"
         raise FileError(sentence, path, line)
     if not text.strip():
-        raise FileError(f"this {what} is empty; see the examples that come with loopcal", path)
+        raise FileError(f"this {what} is empty. See the examples that come with loopcal", path)
     return text
 
 
@@ -101,7 +101,7 @@ def open_bytes(path: str | Path, what: str) -> Iterator[BufferedReader]:
             yield stream
     except FileNotFoundError:
         raise FileError(
-            f"this {what} does not exist; check the name and the folder", path
+            f"this {what} does not exist. Check the name and the folder", path
         ) from None
     except OSError as error:
         action = ACTIONS.get(error.errno or 0, "check the file, its path and its permissions")
@@ -115,12 +115,12 @@ def _open_ordinary_file(path: Path, what: str) -> int:
     which may denote another file a moment later.
     """
     if path.is_dir():  # not every system opens a folder
-        raise FileError(f"this is a folder, but a {what} is needed; name a file in it", path)
+        raise FileError(f"this is a folder, but a {what} is needed. Name a file in it", path)
     descriptor = os.open(path, OPEN_FLAGS)
     if stat.S_ISREG(os.fstat(descriptor).st_mode):
         return descriptor
     os.close(descriptor)
-    sentence = f"this is a device or a pipe, but a {what} is needed; save it as an ordinary file"
+    sentence = f"this is a device or a pipe, but a {what} is needed. Save it as an ordinary file"
     raise FileError(f"{sentence} and name that", path)
 
 
@@ -137,9 +137,9 @@ def resolve_target(path: str | Path) -> Path:
     """
     path = as_path(path, "file to write")
     if path.is_dir():
-        raise FileError("this is a folder; add the name of the file to write", path)
+        raise FileError("this is a folder. Add the name of the file to write", path)
     if path.exists() and not path.is_file():
-        raise FileError("this is a device or a pipe; name an ordinary file", path)
+        raise FileError("this is a device or a pipe. Name an ordinary file", path)
     return resolve_links(path) if path.is_symlink() else path
 
 
@@ -148,7 +148,7 @@ def resolve_links(path: Path) -> Path:
     try:
         return path.resolve()
     except (OSError, RuntimeError):
-        raise FileError("this symbolic link has no target; choose another name", path) from None
+        raise FileError("this symbolic link has no target. Choose another name", path) from None
 
 
 def write_text(path: str | Path, text: str) -> None:
@@ -202,7 +202,7 @@ def report_write_errors(path: str | Path) -> Iterator[None]:
             sentence = f"cannot write here: folder {folder} does not exist; create it first"
             raise FileError(sentence, path) from None
         raise FileError(
-            f"cannot write here ({_reason(error)}); choose another place", path
+            f"cannot write here ({_reason(error)}). Choose another place", path
         ) from error
 
 

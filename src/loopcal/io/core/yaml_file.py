@@ -99,7 +99,7 @@ def parse_yaml(
     with _hide_content(path, what) if not is_ours else nullcontext():
         tree = _load_tree(text, path, what, first_line)
     if not isinstance(tree, Mapping):
-        sentence = f"this {what} contains no 'key: value' lines; see the examples of loopcal"
+        sentence = f"this {what} contains no 'key: value' lines. See the examples of loopcal"
         raise FileError(sentence, path)
     file = YamlFile(path, text, tree, {}, first_line)
     with _hide_content(path, what) if not is_ours else nullcontext():
@@ -124,14 +124,14 @@ def _load_tree(text: str, path: Path, what: str, first_line: int) -> Any:
     from ruamel.yaml.error import MarkedYAMLError, YAMLError
 
     if (directive := _DIRECTIVE.match(text)) is not None:
-        sentence = "YAML directives, which begin with %, are not allowed here; remove the line"
+        sentence = "YAML directives, which begin with %, are not allowed here. Remove the line"
         raise FileError(sentence, path, directive[0].count("\n") + first_line)
     try:
         return _parse_text(text) if len(text) <= KEPT_LENGTH else _parse_text.__wrapped__(text)
     except DuplicateKeyError as error:
         key = str(error.problem).split('"')[1] if '"' in str(error.problem) else "?"
         line = error.problem_mark.line + first_line if error.problem_mark else None
-        raise FileError(f"duplicate key {quote(key)}; remove one", path, line) from None
+        raise FileError(f"duplicate key {quote(key)}. Remove one", path, line) from None
     except _RefusedError as error:
         line = error.line + first_line
         if isinstance(error.refusal, FileLimit):
@@ -140,12 +140,12 @@ def _load_tree(text: str, path: Path, what: str, first_line: int) -> Any:
     except MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         problem = _shorten(error.problem or error.context or "not YAML")
-        sentence = f"not valid YAML ({problem}); check indentation, brackets and colons"
+        sentence = f"not valid YAML ({problem}). Check indentation, brackets and colons"
         raise FileError(sentence, path, mark.line + first_line if mark else None) from None
     except (YAMLError, ValueError, RecursionError, LookupError, AssertionError) as error:
         if "integer string conversion" in str(error):  # Python reads no more than 4300 digits
-            raise FileError("a number has thousands of digits; write a shorter one", path) from None
-        sentence = f"not valid YAML ({_shorten(error)}); correct the syntax"
+            raise FileError("a number has thousands of digits. Write a shorter one", path) from None
+        sentence = f"not valid YAML ({_shorten(error)}). Correct the syntax"
         raise FileError(sentence, path) from None
 
 
@@ -175,8 +175,8 @@ def refuse_unknown_keys(
         raise FileError(finding, file.path)
     for key in keys:
         if key not in allowed:
-            hint = suggest_names(key, allowed) or f"; allowed: {', '.join(sorted(allowed))}"
-            sentence = f"unknown key {key!r}{_inside(location)}{hint}; correct or remove it"
+            hint = suggest_names(key, allowed) or f". Allowed: {', '.join(sorted(allowed))}"
+            sentence = f"unknown key {key!r}{_inside(location)}{hint}. Correct or remove it"
             raise file.error(sentence, (*location, key))
 
 
@@ -213,7 +213,7 @@ def _to_plain(node: Any, file: YamlFile, location: Location, has_names: bool) ->
         for key, value in node.items():
             place = (*location, key)
             if not isinstance(key, str):
-                sentence = f"key {quote(key)}{_inside(location)} is not text; put it in quotes"
+                sentence = f"key {quote(key)}{_inside(location)} is not text. Put it in quotes"
                 raise file.error(sentence, place)
             if has_names and (fault := find_fault_below(location, key)) is not None:
                 raise file.error(fault, place)
@@ -231,13 +231,13 @@ def _to_plain(node: Any, file: YamlFile, location: Location, has_names: bool) ->
             if math.isfinite(float(value)):
                 return value
         shown = "too large" if isinstance(value, int) else value  # it may have thousands of digits
-        raise file.error(f"{name_location(location)!r} is {shown}; write a finite number", location)
+        raise file.error(f"{name_location(location)!r} is {shown}. Write a finite number", location)
     if isinstance(node, Sequence):
         return [_to_plain(item, file, (*location, i), has_names) for i, item in enumerate(node)]
     if isinstance(node, datetime.date):
         return node.isoformat()
     raise file.error(
-        f"{name_location(location)!r} has no value that loopcal reads; put it in quotes", location
+        f"{name_location(location)!r} has no value that loopcal reads. Put it in quotes", location
     )
 
 
@@ -286,7 +286,7 @@ def _make_bounded_composer(loader: Any) -> Any:
             node = self._compose_counted(parent, index, event)
             is_key = parent is not None and index is None
             if is_key and not isinstance(node, ScalarNode):
-                sentence = "a key is a list or a mapping; write text there"
+                sentence = "a key is a list or a mapping. Write text there"
                 raise _RefusedError(sentence, event.start_mark.line)
             return node
 
@@ -300,7 +300,7 @@ def _make_bounded_composer(loader: Any) -> Any:
                 self._add(self._sizes.get(event.anchor, 1), event)
                 return super().compose_node(parent, index)
             if event.tag is not None:
-                raise _RefusedError("YAML tags are not allowed here; remove the tag", line)
+                raise _RefusedError("YAML tags are not allowed here. Remove the tag", line)
             before = self._count
             self._add(1, event)
             self._level += 1

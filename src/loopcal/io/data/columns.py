@@ -86,7 +86,7 @@ class TextColumn(Column):
         for row, cell in enumerate(cells):
             if self.choices and cell and cell not in self.choices:
                 allowed = " or ".join(self.choices)
-                sentence = f"column {self.name!r} is {cell!r}; write {allowed}, or leave it empty"
+                sentence = f"column {self.name!r} is {cell!r}. Write {allowed}, or leave it empty"
                 raise table.row_error(row, sentence)
         return tuple(unicodedata.normalize("NFC", cell) for cell in cells)
 
@@ -184,13 +184,13 @@ class ContextColumn(Column):
         if symbol is None or symbol not in self.units:
             stated = "no unit" if symbol is None else f"the unit {symbol!r}"
             allowed = ", ".join(f"[{s}]" for s in self.units)
-            raise table.header_error(f"column {self.name!r} has {stated}; write one of {allowed}")
+            raise table.header_error(f"column {self.name!r} has {stated}. Write one of {allowed}")
         factor, offset = self.units[symbol]
         values = table.scaled_numbers(self.name, factor) + offset
         lowest = -math.inf if self.name == TIME else ABSOLUTE_ZERO - ROUNDING
         for row in np.flatnonzero(values < lowest).tolist():
             sentence = f"column {self.name!r} is {cells[row]} {symbol}, below absolute zero"
-            raise table.row_error(row, f"{sentence}; correct it, or leave the cell empty")
+            raise table.row_error(row, f"{sentence}. Correct it, or leave the cell empty")
         return values
 
     @staticmethod
@@ -256,7 +256,7 @@ BLOCK_COLUMN = PoseColumn(
     decode=lambda block: [str(number) for number in block],
     is_needed=lambda block: len(set(block.tolist())) < len(block),
     conflict=lambda pose, block, other, place: (
-        f"pose {pose!r} is in block {block!r} here and {other!r} in {place}; correct one"
+        f"pose {pose!r} is in block {block!r} here and {other!r} in {place}. Correct one"
     ),
     is_required=True,
 )
@@ -421,9 +421,9 @@ def refuse_unknown_columns(table: Table, robot: Mechanism, kinds: Sequence[Kind]
             continue
         hint = suggest_header(name, table.units[name], known) or suggest_names(name, known)
         families = sorted({re.sub(r"\..*", ".*", known_name) for known_name in known})
-        hint = hint or f"; allowed: {', '.join(families)}"
+        hint = hint or f". Allowed: {', '.join(families)}"
         act = f"correct it, or call it '{NOTE} {name}' to ignore it"
-        why = "" if kinds else " (this file states no kind, so it only gives the readings of poses)"
+        why = "" if kinds else " (this file has no kind, so it only gives the readings of poses)"
         raise table.header_error(f"column {name!r} is unknown{hint}; {act}{why}")
 
 

@@ -130,11 +130,11 @@ def read_kind(file: YamlFile, node: Mapping[str, Any], location: Location) -> Ki
     name = node.get("kind")
     if name is None:
         example = "write '# kind: pose' at the top, or 'kind: pose' in a .yaml file of this name"
-        sentence = f"no kind of measurement is stated; {example} (kinds: {', '.join(KINDS)})"
+        sentence = f"the kind of measurement is missing; {example} (kinds: {', '.join(KINDS)})"
         raise file.error(sentence, location)
     if not isinstance(name, str) or name not in KINDS:
         sentence = f"{quote(name)} is not a kind of measurement{suggest_names(str(name), KINDS)}"
-        raise file.error(f"{sentence}; allowed: {', '.join(KINDS)}", (*location, "kind"))
+        raise file.error(f"{sentence}. Allowed: {', '.join(KINDS)}", (*location, "kind"))
     kind = KINDS[name]
     settings = {key: node[key] for key in list_kind_settings(kind) if key in node}
     hints = get_field_types(make_settings_record(kind))
@@ -143,7 +143,7 @@ def read_kind(file: YamlFile, node: Mapping[str, Any], location: Location) -> Ki
     for key, value in given.items():
         if hints[key] in (LENGTHS, NUMBERS):
             if not _is_array(value):
-                sentence = "must be a list of numbers, or of lists of equal length; correct it"
+                sentence = "must be a list of numbers, or of lists of equal length. Correct it"
                 raise file.error(f"{key!r} {sentence}", (*location, key))
             given[key] = np.array(value, dtype=float)
         elif isinstance(value, PoseRecord):
@@ -177,8 +177,8 @@ def read_noise(
     sight = kind.sight_noise
     if not isinstance(stated, dict):
         example = ", ".join(f"{name}: {EXAMPLES[d]}" for name, d in dimensions.items())
-        sentence = "'noise' must state a standard deviation for each column"
-        raise file.error(f"{sentence}; write 'noise: {{{example}}}'", place)
+        sentence = "'noise' must give a standard deviation for each column"
+        raise file.error(f"{sentence}. Write 'noise: {{{example}}}'", place)
     return {
         column: _read_size(
             file, text, {**dimensions, **sight}[column], at, f"the noise of {at[-1]!r}"
@@ -233,10 +233,10 @@ def _choose_form(
         sentence = (
             "an uncertainty is stated once: as 'sd', as 'limit' (uniform within it), or as 'U'"
         )
-        raise file.error(f"{sentence} with its 'k'; write one of them", place)
+        raise file.error(f"{sentence} with its 'k'. Write one of them", place)
     form, k = forms[0], stated.get("k", 2.0)
     if not (isinstance(k, int | float) and 1.0 <= k <= MOST_K) or ("k" in stated and form != "U"):
-        sentence = f"'k' is {k!r}; write the coverage factor of 'U', from 1 to {MOST_K:g}"
+        sentence = f"'k' is {k!r}. Write the coverage factor of 'U', from 1 to {MOST_K:g}"
         raise file.error(sentence, (*place, "k") if "k" in stated else place)
     distribution, divisor = FORMS[form]
     return form, distribution, divisor or float(k)
@@ -401,14 +401,14 @@ def read_stated_values(
             if name in known and known[name][0] != value:
                 _, other, other_place = known[name]
                 line = f"{other.path}:{other.line(other_place)}"
-                sentence = f"parameter {name!r} is stated differently in {line}; state it once"
+                sentence = f"parameter {name!r} is stated differently in {line}. Give it once"
                 raise file.error(sentence, place)
         known = of_file | known
     common = [name for name, (value, _, _) in known.items() if value.scope == "all"]
     for name, (_, file, place) in known.items():
         if any(name != other and _is_parameter(name, other) for other in common):
             sentence = f"parameter {name!r} has the scope all in another line or file"
-            raise file.error(f"{sentence}; state its scope once", place)
+            raise file.error(f"{sentence}. Give its scope once", place)
     return tuple(value for value, _, _ in known.values())
 
 
@@ -436,8 +436,8 @@ def _read_values_of_file(
         for name in names:
             prior = replace(value, name=name)
             if values.setdefault(name, (prior, file, ()))[0] != prior:
-                sentence = f"two kinds of this file state {value.name!r} differently"
-                raise file.error(f"{sentence}; state it alike, or give their frames two names")
+                sentence = f"two kinds of this file define {value.name!r} differently"
+                raise file.error(f"{sentence}. Give it alike, or give their frames two names")
     own_names = {p.name for rows in observations for p in rows.kind.nuisance_parameters}
     for pattern, node in stated.items():
         place = (KEY, pattern)
@@ -505,7 +505,7 @@ def _match(file: YamlFile, entries: Sequence[Parameter], stated: str) -> list[Pa
         matching = matching or [entry for entry in entries if entry.name.endswith(".offset")]
     if not matching:
         names = [entry.name for entry in entries]
-        allowed = ", ".join(names[:12]) or "none; state some, as 'unknown: [frame]' of the kind"
+        allowed = ", ".join(names[:12]) or "none. Give some, as 'unknown: [frame]' of the kind"
         sentence = f"this file has no setup parameter {pattern!r}{suggest_names(pattern, names)}"
         raise file.error(f"{sentence}; it has {allowed}", (KEY, stated))
     return matching
@@ -523,7 +523,7 @@ def _read_one(
         raise file.error(f"{node!r} does not state knowledge of a parameter; {EXAMPLE}", place)
     dimensions = {entry.dimension for entry in matching}
     if len(dimensions) > 1 and ("start" in node or "sd" in node):
-        sentence = "this pattern matches lengths and angles; state them in separate lines"
+        sentence = "this pattern matches lengths and angles. Give them in separate lines"
         raise file.error(sentence, place)
     stated = read_record(file, node, RECORDS[matching[0].dimension], None, place)
     is_only_shared = stated.scope == "all" and not stated.fixed and "sd" not in node
@@ -550,7 +550,7 @@ def read_instrument(
     if isinstance(stated, str):
         return InstrumentRecord(name=stated)
     if not isinstance(stated, dict) or not stated:
-        sentence = "'instrument' is neither a name nor facts of an instrument; write its name, or"
+        sentence = "'instrument' is neither a name nor facts of an instrument. Write its name, or"
         example = 'instrument: {name: AT960, serial_number: "750123", certificate: D-K-15123}'
         raise file.error(f"{sentence} '{example}'", place)
     try:
@@ -643,14 +643,14 @@ def read_shared_errors(
         measured = set(components.values())
         if not measured or (key in SCALED and Dimension.LENGTH not in measured):
             what = "lengths" if key in SCALED else "values"
-            raise file.error(f"the kind {kind.name!r} measures no {what}; remove {key!r}", place)
+            raise file.error(f"the kind {kind.name!r} measures no {what}. Remove {key!r}", place)
         if key in SCALED:
             lengths, factors, scope = _read_scales(file, key, stated, place)
             columns = [c.name for c in kind.noise_columns if c.dimension is Dimension.LENGTH]
             noise |= {} if lengths is None else dict.fromkeys(columns, lengths)
             if key == MPE and "scale" in node:
-                sentence = f"{MPE!r} and 'scale' both state the scale of the instrument"
-                raise file.error(f"{sentence}; remove one of them", place)
+                sentence = f"{MPE!r} and 'scale' both define the scale of the instrument"
+                raise file.error(f"{sentence}. Remove one of them", place)
             kind = _add_unknown(kind, tuple(factors))
             for item, (mean, sd, size) in factors.items():
                 name = name_shared_error(kind, item, "")
@@ -658,7 +658,7 @@ def read_shared_errors(
             continue
         if stated != UNKNOWN and not (isinstance(stated, dict) and stated):
             example = ", ".join(f"{name}: {EXAMPLES[d]}" for name, d in components.items())
-            sentence = f"{key!r} is {stated!r}; write '{key}: {UNKNOWN}', or standard deviations"
+            sentence = f"{key!r} is {stated!r}. Write '{key}: {UNKNOWN}', or standard deviations"
             raise file.error(f"{sentence}, as '{key}: {{{example}}}'", place)
         item = ITEMS[key]
         kind = _add_unknown(kind, (item,))
@@ -691,11 +691,11 @@ def _read_scales(
     """
     rule = SCALED[key]
     if not isinstance(node, dict) or not node:
-        raise file.error(f"{key!r} is {node!r}; write '{key}: {{{rule.example}}}'", place)
+        raise file.error(f"{key!r} is {node!r}. Write '{key}: {{{rule.example}}}'", place)
     has_forms = "sd" in rule.units
     refuse_unknown_keys(file, list(node), [*rule.units, "scope", *["k"] * has_forms], place)
     if missing := [name for name in rule.required if name not in node]:
-        sentence = f"{key!r} has no key {missing[0]!r}; add it"
+        sentence = f"{key!r} has no key {missing[0]!r}. Add it"
         raise file.error(f"{sentence}, as in '{key}: {{{rule.example}}}'", place)
     stated = {
         name: _read_in_units(file, node[name], units, (*place, name))
@@ -704,7 +704,7 @@ def _read_scales(
     }
     scope = node.get("scope", "session")
     if scope not in ("session", "all"):
-        sentence = f"the scope is {scope!r}; write session, or all for one value in all sessions"
+        sentence = f"the scope is {scope!r}. Write session, or all for one value in all sessions"
         raise file.error(sentence, (*place, "scope"))
     for name in (n for n in stated if n in NOT_NEGATIVE and stated[n] != 0.0):
         if fault := find_sd_fault(stated[name]):
@@ -736,11 +736,11 @@ def _read_in_units(file: YamlFile, node: Any, units: Scales, place: Location) ->
     symbol = text[match.end() :].strip() if match else ""
     if not np.isfinite(number) or symbol not in units:
         allowed = ", ".join(units)
-        sentence = f"{place[-1]!r} of {place[-2]!r} is {node!r}; write a number and one of"
+        sentence = f"{place[-1]!r} of {place[-2]!r} is {node!r}. Write a number and one of"
         raise file.error(f"{sentence} {allowed}", place)
     factor, offset = units[symbol]
     if units is TEMPERATURE_UNITS and factor * number + offset < ABSOLUTE_ZERO - ROUNDING:
-        raise file.error(f"{place[-1]!r} is {node}, below absolute zero; correct it", place)
+        raise file.error(f"{place[-1]!r} is {node}, below absolute zero. Correct it", place)
     return factor * number + offset
 
 
@@ -748,7 +748,7 @@ def _read_in_units(file: YamlFile, node: Any, units: Scales, place: Location) ->
 
 SETTINGS: Mapping[str, str] = {
     "format": "1",
-    "robot": "name of the robot; a different name than that of the robot in use is reported",
+    "robot": "name of the robot; loopcal reports a difference from the robot in use",
     "instrument": "name of the instrument, or its facts for traceability; see "
     "[instruments](#instruments-and-their-traceability)",
     "controller": "robot file of the geometry that converts commanded coordinates to readings; "
@@ -763,11 +763,11 @@ SETTINGS: Mapping[str, str] = {
     **SHARED_ERRORS,
     "unknowns": "name or pattern -> prior knowledge of a setup parameter (frame, target, surface, "
     "offset), or `fixed`",
-    "session": "session of all rows whose column states none",
-    "group": "group of all rows whose column states none",
+    "session": "session of all rows without an entry in the column",
+    "group": "group of all rows without an entry in the column",
     "reading_noise": "standard deviation of the readings: one for all, or actuator or pattern -> "
     "one; that of the robot file by default",
-    "poses": "another file, in the same folder, with the readings of the poses",
+    "poses": "another file in this folder, with the readings of the poses",
 }
 KIND_SETTINGS = ("noise", "noise_source", "instrument", *SHARED_ERRORS)
 """Settings beside those of the kind itself."""
@@ -822,7 +822,7 @@ def read_kinds(table: Table, robot: Mechanism, several: bool = False) -> tuple[K
         cells = np.array(table.text("kind"))
         for row, cell in enumerate(cells):
             if cell and cell not in labeled:  # without a kind, a row only holds readings
-                sentence = f"column 'kind' is {cell!r}; allowed: {', '.join(labeled)}"
+                sentence = f"column 'kind' is {cell!r}. Allowed: {', '.join(labeled)}"
                 raise table.row_error(row, sentence)
         kinds = tuple(
             _read_entry(file, node, robot, ("kinds", label), np.flatnonzero(cells == label))
@@ -893,7 +893,7 @@ def _read_entry(
     sizes = {name: size for name, (_, size) in stated.items()}
     source = node.get("noise_source", "stated")
     if source not in (ASSUMED, "stated"):
-        sentence = f"noise_source is {source!r}; write {ASSUMED} where nobody stated the noise"
+        sentence = f"noise_source is {source!r}. Write {ASSUMED} if the noise is unknown"
         raise file.error(f"{sentence}, or stated", (*place, "noise_source"))
     instrument = read_instrument(file, node, place)
     if instrument is None and place:
@@ -934,7 +934,7 @@ def _select_rows(table: Table, entry: KindRows, members: Sequence[tuple[int, ...
             sentence = (
                 f"this row names {count} poses, but the kind {entry.kind.name!r} needs {links}"
             )
-            raise table.row_error(int(row), f"{sentence}; correct the column 'pose'")
+            raise table.row_error(int(row), f"{sentence}. Correct the column 'pose'")
     return entry
 
 
@@ -985,7 +985,7 @@ def _read_names(table: Table, name: str, rows: IntArray) -> NDArray[np.str_]:
     """Return the sessions or groups (r,) of rows: of their cells, else of the setting, else ''."""
     stated = table.settings.content.get(name, "")
     if isinstance(stated, dict | list):
-        sentence = f"{name!r} names the {name} of all rows; write a name or a number"
+        sentence = f"{name!r} names the {name} of all rows. Write a name or a number"
         raise table.settings.error(sentence, (name,))
     usual = str(stated if stated is not None else "").strip()
     if name not in table.units:
@@ -1024,6 +1024,6 @@ def _read_sigma(
         sigma = np.where(absent & np.isnan(sigma), positive[0], sigma)
     for i in np.flatnonzero(~(sigma >= SMALLEST_SD)):
         size = "too small" if sigma[i] > 0.0 else "not positive"
-        sentence = f"column {name!r} is {size}; write a standard deviation"
+        sentence = f"column {name!r} is {size}. Write a standard deviation"
         raise table.row_error(int(entry.rows[i]), sentence)
     return sigma

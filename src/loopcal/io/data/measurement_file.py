@@ -147,14 +147,14 @@ def _join_poses(files: Sequence[_File], robot: Mechanism) -> dict[str, tuple[int
                 else:
                     origin[name] = (i, row)
             elif name not in read and states_readings:
-                sentence = f"pose {name!r} has no readings in any file; add them in one"
+                sentence = f"pose {name!r} has no readings in any file. Add them in one"
                 raise file.table.row_error(row, sentence)
         _refuse_contradictions(file, files, repeated)
     if not origin:
-        why = "no row has readings; add a row with readings for each pose"
+        why = "no row has readings. Add a row with readings for each pose"
         if all(file.is_base.all() for file in files):
-            why = "all rows measure targets on the base, so that there is no pose"
-            why += "; give the file of the poses, too"
+            why = "all rows measure targets on the base, so there is no pose"
+            why += ". Give the file of the poses, too"
         raise files[0].table.row_error(0, why)
     return origin
 
@@ -170,7 +170,7 @@ def _find_members(file: _File, poses: Iterable[str]) -> list[tuple[int, ...]]:
         names = [part.strip() for part in cell.split(LINK)]
         for name in (name for name in names if name not in number):
             sentence = f"unknown pose {name!r}{suggest_names(name, number)}"
-            raise file.table.row_error(row, f"{sentence}; add a row with its readings")
+            raise file.table.row_error(row, f"{sentence}. Add a row with its readings")
         members.append(tuple(number[name] for name in names))
     return members
 
@@ -203,7 +203,7 @@ def _read_pose_column(
             if column.is_required:
                 pairs = [(row, file.members[row][0]) for row in file.first.values()]
             for row in (row for row, _ in pairs if not cells[row]):
-                sentence = f"column {column.name!r} is empty; write a name or a number"
+                sentence = f"column {column.name!r} is empty. Write a name or a number"
                 raise file.table.row_error(row, sentence)
             yield file.table, cells, pairs
 
@@ -227,7 +227,7 @@ def _collect_pose_context(files: Sequence[_File], n: int) -> dict[str, FloatArra
 
     found: dict[str, FloatArray] = {}
     for name in dict.fromkeys(name for file in files for name in file.context):
-        fact = f"column {name!r} has another value in an earlier row of this pose; correct one"
+        fact = f"column {name!r} has another value in an earlier row of this pose. Correct one"
         stated = _collect(list_statements(name), lambda *_, fact=fact: fact)
         if stated:
             found[name] = np.array([stated.get(i, np.nan) for i in range(n)])
@@ -255,15 +255,15 @@ def _read_file(table: Table, kinds: tuple[KindRows, ...], robot: Mechanism, seve
         for row in np.flatnonzero(is_base).tolist():
             if cells[row]:
                 sentence = f"this row measures the base and belongs to no pose, but column {name!r}"
-                raise table.row_error(row, f"{sentence} is {cells[row]!r}; leave it empty")
+                raise table.row_error(row, f"{sentence} is {cells[row]!r}. Leave it empty")
     first: dict[str, int] = {}
     is_of_base = len(table) > 0 and bool(is_base.all())
     if several and "pose" not in table.units and not is_of_base:
         sentence = "files are joined by the names of poses, and this file names none"
-        raise table.header_error(f"{sentence}; add a column 'pose'")
+        raise table.header_error(f"{sentence}. Add a column 'pose'")
     for row in np.flatnonzero(~is_base).tolist():
         if not names[row]:
-            raise table.row_error(row, "column 'pose' is empty; write a name or a number")
+            raise table.row_error(row, "column 'pose' is empty. Write a name or a number")
         if LINK not in names[row]:
             first.setdefault(names[row], row)
     nothing = np.full((len(table), len(actuators)), np.nan)
@@ -294,20 +294,20 @@ def _read_readings(file: _File, robot: Mechanism, several: bool) -> _File:
     if not may_be_absent:
         # with several files, another one may state all readings of a pose
         is_first = begin == np.arange(len(rows))
-        hint = f", or state '{READING_NOISE}', so that empty means not read"
+        hint = f", or state '{READING_NOISE}', to mark empty cells as not read"
         for row in np.flatnonzero(is_first & absent.any(axis=1) & ~(several & absent.all(axis=1))):
             name = (*columns, *loads)[int(np.argmax(absent[row]))].name
             sentence = f"column {name!r} is empty"
-            act = f"write its value{hint if controller is None else ''}"
-            raise table.row_error(int(row), f"{sentence}; {act}")
+            act = f"Write its value{hint if controller is None else ''}"
+            raise table.row_error(int(row), f"{sentence}. {act}")
     is_same = ((rows == rows[begin]) | (absent & absent[begin])).all(axis=1) & (begin >= 0)
     for row in np.flatnonzero(~is_same & ~absent.all(axis=1)).tolist():
-        sentence = f"the row of {names[row]!r} compares poses and has no readings of its own"
-        act = "leave these cells empty"
+        sentence = f"the row of {names[row]!r} compares poses and has no separate readings"
+        act = "Leave these cells empty"
         if begin[row] >= 0:
             sentence = f"pose {names[row]!r} has other readings in line {table.lines[begin[row]]}"
-            act = "correct them, or rename one of the two poses"
-        raise table.row_error(row, f"{sentence}; {act}")
+            act = "Correct them, or rename one of the two poses"
+        raise table.row_error(row, f"{sentence}. {act}")
     empty = set(np.flatnonzero(absent.all(axis=1)).tolist())
     unread = frozenset(name for name, row in file.first.items() if row in empty)
     read = frozenset(file.first) - unread
@@ -366,7 +366,7 @@ def _list_reading_columns(
         both = next((name for name in own if name in table.units), None)
         if both is not None:
             sentence = f"this file has readings ({both!r}) and commanded coordinates"
-            raise table.header_error(f"{sentence}; remove one of the two")
+            raise table.header_error(f"{sentence}. Remove one of the two")
     require_columns(table, names, why)
     known = list_columns(robot, ()) | list_columns(controller or robot, ())
     return [known[name] for name in names]
@@ -380,7 +380,7 @@ def _load_controller(table: Table, robot: Mechanism) -> Mechanism | None:
             sentence = (
                 "a controller is named, but this file has readings, not commanded coordinates"
             )
-            raise table.settings.error(f"{sentence}; remove 'controller'", ("controller",))
+            raise table.settings.error(f"{sentence}. Remove 'controller'", ("controller",))
         return None
     if name is None:
         return robot.nominal
@@ -416,7 +416,7 @@ def _read_reading_sigma(table: Table, robot: Mechanism, readings: FloatArray) ->
         for name in names:
             stated[name] = file.quantity(text, dimensions[name], place)
             if stated[name] != 0.0 and (fault := find_sd_fault(stated[name])):
-                sentence = f"the noise of readings is {text}; {fault}, or 0 where exact"
+                sentence = f"the noise of readings is {text}; {fault}, or 0 for exact readings"
                 raise file.error(sentence, place)
     sigma = np.tile(list(stated.values()), (len(readings), 1))
     known = list_columns(robot, ())
@@ -427,14 +427,16 @@ def _read_reading_sigma(table: Table, robot: Mechanism, readings: FloatArray) ->
         cells = known[name].parse(table)
         for row in np.flatnonzero((cells != 0.0) & (cells < SMALLEST_SD)):
             size = "negative" if cells[row] < 0.0 else "too small"
-            sentence = f"column {name!r} is {size}; write a standard deviation, 0 where exact"
+            sentence = (
+                f"column {name!r} is {size}. Write a standard deviation, or 0 for exact readings"
+            )
             raise table.row_error(int(row), sentence)
         sigma[:, i] = np.where(np.isnan(cells), sigma[:, i], cells)
         if actuator.sigma is None:
             for row in np.flatnonzero(np.isnan(sigma[:, i]) & ~np.isnan(readings[:, i])):
-                sentence = f"column {name!r} is empty, and no other noise of this reading is stated"
-                act = f"write it, 0 where it is exact or inf, or state '{READING_NOISE}'"
-                raise table.row_error(int(row), f"{sentence}; {act}")
+                sentence = f"column {name!r} is empty, and this reading has no other noise"
+                act = f"Write it, 0 if it is exact, or inf, or give '{READING_NOISE}'"
+                raise table.row_error(int(row), f"{sentence}. {act}")
     return np.where(np.isnan(readings), np.inf, sigma)
 
 
@@ -457,8 +459,8 @@ def _refuse_contradictions(
             number, other = others[i]
             place = files[number].table.place(other)
             sentence = f"pose {file.names[rows[i]]!r} has other {what} here than in {place}"
-            act = "correct them, or rename the pose in one of the files"
-            raise file.table.row_error(rows[i], f"{sentence}; {act}")
+            act = "Correct them, or rename the pose in one of the files"
+            raise file.table.row_error(rows[i], f"{sentence}. {act}")
 
 
 FORMAT = 1
@@ -529,7 +531,7 @@ def join_tables(
     several = len(tables) > 1
     kinds = [(table, read_kinds(table, robot, several)) for table in tables]
     if not any(of_file for _, of_file in kinds):
-        sentence = "no file states a kind of measurement; write '# kind: ..' at the top of one"
+        sentence = "no file has a kind of measurement. Write '# kind: ..' at the top of one"
         raise FileError(sentence, tables[0].path)
     _check_base_targets(kinds)
     files = [_read_file(*each, robot, several) for each in kinds]
@@ -633,7 +635,7 @@ def load_pose_names(path: str | Path) -> tuple[tuple[str, ...], tuple[str, ...]]
     for i, name in enumerate(names):
         if first.setdefault(name, i) != i:
             row = first[name] + 1
-            sentence = f"pose {name!r} is also row {row}; give each pose a name of its own"
+            sentence = f"pose {name!r} is also row {row}. Give each pose a separate name"
             raise table.row_error(i, sentence)
     return names, tuple(map(table.place, range(len(names))))
 
@@ -643,12 +645,12 @@ def read_tables(path: Paths) -> tuple[Table, ...]:
     given = path if isinstance(path, list | tuple) else [path]
     paths = [as_path(file, WHAT) for file in given]
     if not paths:
-        raise DataError("no measurement file is given; name at least one")
+        raise DataError("no measurement file is given. Name at least one")
     tables: list[Table] = []
     for file in paths:
         table = read_table(file)
         if any(file.samefile(other.path) for other in tables):
-            raise FileError("this file is given twice; name it once", file)
+            raise FileError("this file is given twice. Name it once", file)
         if "format" in table.settings.content:
             check_format(table.settings, FORMAT)
         tables.append(table)
@@ -715,7 +717,7 @@ def _build_instrument(table: Table, kinds: Sequence[KindRows]) -> Instrument:
             if column.name not in entry.noise:
                 example = f"noise: {{{column.name}: {EXAMPLES[column.dimension]}}}"
                 sentence = (
-                    f"planning and simulation need the noise of {column.name!r}; add '{example}'"
+                    f"planning and simulation need the noise of {column.name!r}. Add '{example}'"
                 )
                 raise table.settings.error(sentence, (*entry.location, "noise"))
         sigma = np.array([entry.noise[column.name] for column in entry.kind.noise_columns])

@@ -53,7 +53,7 @@ and correlation up to which there is none [1].
 """
 
 ADDED = """\
-# Add one row for each pose below: its name, readings and measured values; leave empty what was not
+# Add one row for each pose below: its name, readings and measured values. Leave empty what was not
 # measured.
 # Optional setting for traceability: instrument: {name: .., serial_number: "..", certificate: "..",
 #   laboratory: .., standard: .., calibrated: 2026-01-31, due: 2027-01-31, measured: 2026-05-31}
@@ -63,7 +63,7 @@ ADDED = """\
 
 COMPARED = f"""\
 # A row of the kind {{}} compares two poses: name them in the column pose as a{LINK}b and leave its
-# readings empty. Each of these poses needs a row of its own with its readings."""
+# readings empty. Each of these poses needs a separate row with its readings."""
 """Remark of a template on a kind that compares poses."""
 
 UNKNOWN_TARGETS = """\
@@ -256,11 +256,11 @@ def _refuse_names(data: Measurements) -> None:
             reason = f"names of poses must not be empty or contain {LINK!r}"
         else:
             continue
-        raise DataError(f"the {what} {name!r} cannot be written: {reason}; rename it")
+        raise DataError(f"the {what} {name!r} cannot be written: {reason}. Rename it")
     labels = [unicodedata.normalize("NFC", name) for name in data.labels]
     if len(set(labels)) < len(labels):
         name = next(name for name in labels if labels.count(name) > 1)
-        raise DataError(f"two poses are named {name!r}, but names must differ; rename one")
+        raise DataError(f"two poses are named {name!r}, but names must differ. Rename one")
 
 
 def _tabulate_readings(

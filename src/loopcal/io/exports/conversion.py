@@ -98,7 +98,7 @@ def read_lines(path: Path, profile: Profile, clock: PatternClock) -> tuple[list[
         if named and named <= set(names):
             for name in sorted(named):
                 if names.count(name) > 1:
-                    sentence = f"duplicate column {name!r}; name it by its place in the profile"
+                    sentence = f"duplicate column {name!r}. Name it by its place in the profile"
                     raise FileError(sentence, path, number)
             places = {name: place for place, name in reversed(list(enumerate(names)))}
             header = Header(places, len(names))
@@ -124,7 +124,7 @@ def _refuse_header(
     if nearest is None or nearest[0] == 0:
         names, number = ", ".join(sorted(named)), None if nearest is None else nearest[1]
         sentence = f"no line names the columns {names} of {profile.file.path}"
-        raise FileError(f"{sentence}; correct the profile", path, number)
+        raise FileError(f"{sentence}. Correct the profile", path, number)
     _, number, cells = nearest
     known = {cell.casefold(): cell for cell in reversed(cells) if cell}
     missing = []
@@ -184,19 +184,19 @@ def _count_cells(count: int) -> str:
 def _decode(path: Path, profile: Profile) -> str:
     """Return the text of the export."""
     raw = read_bytes(path, "export", TABLE_SIZE)
-    act = "state its 'encoding' in the profile"
+    act = "Give its 'encoding' in the profile"
     try:
         text = raw.decode(profile.encoding)
     except UnicodeDecodeError as error:
         line = raw.count(b"\n", 0, error.start) + 1
-        sentence = f"byte 0x{raw[error.start]:02x} is not {profile.record.encoding} text; {act}"
+        sentence = f"byte 0x{raw[error.start]:02x} is not {profile.record.encoding} text. {act}"
         raise FileError(sentence, path, line) from None
     except UnicodeError as error:
         raise FileError(
-            f"this is not {profile.record.encoding} text ({error}); {act}", path
+            f"this is not {profile.record.encoding} text ({error}). {act}", path
         ) from None
     if not text.strip():
-        raise FileError("this export is empty; export it again", path)
+        raise FileError("this export is empty. Export it again", path)
     return text
 
 
@@ -377,12 +377,12 @@ def convert_export(
     misfits.sort()
     if not rows:
         if not misfits:
-            raise FileError("the profile skips every line of this export; correct it", path)
+            raise FileError("the profile skips every line of this export. Correct it", path)
         number, reason = misfits[0]
         sentence = f"no line of this export fits {profile.file.path}"
         if read[0].header is None and not fitting:
             # nothing shows that the profile is meant for this file, which may contain secrets
-            raise FileError(f"{sentence}; compare the first one with the profile", path, number)
+            raise FileError(f"{sentence}. Compare the first one with the profile", path, number)
         raise FileError(f"{sentence}; reason for the first one: {reason}", path, number)
     settings = {"format": FORMAT, **profile.record.settings}
     remark = format_comment(f"converted from {path.name} by {profile.file.path.name}")
@@ -471,12 +471,12 @@ def _scale_sigma(text: str, source: ColumnSource, name: str) -> str:
         return ""
     scaled = Decimal(text) * Decimal(repr(source.factor))
     if scaled < 0:
-        act = "list this number under 'missing' if it means unknown"
-        raise Misfit(f"{name!r} is {text}, but no standard deviation is negative; {act}")
+        act = "List this number under 'missing' if it means unknown"
+        raise Misfit(f"{name!r} is {text}, but no standard deviation is negative. {act}")
     if scaled < Decimal(source.least):
         return source.least
     if scaled <= 0:
-        raise Misfit(f"{name!r} is {text}, but must be positive; state a 'floor' in the profile")
+        raise Misfit(f"{name!r} is {text}, but must be positive. Give a 'floor' in the profile")
     return text if source.factor == 1.0 else f"{scaled.normalize():.17g}"
 
 

@@ -98,10 +98,10 @@ def refuse_pattern(file: YamlFile, text: str, location: Location) -> None:
         re.compile(text)
         regex.compile(text)
     except (re.error, regex.error) as error:
-        sentence = f"{shown} is not a regular expression ({error}); correct it"
+        sentence = f"{shown} is not a regular expression ({error}). Correct it"
         raise file.error(sentence, location) from None
     except (RecursionError, OverflowError):
-        sentence = f"the pattern {shown} is too deeply nested; simplify it"
+        sentence = f"the pattern {shown} is too deeply nested. Simplify it"
         raise file.error(sentence, location) from None
 
 
@@ -332,20 +332,20 @@ def read_profile(path: str | Path) -> Profile:
         check_format(file, FORMAT)
     kind = _read_kind(file, record)
     if DELIMITERS[record.delimiter] == DECIMALS[record.decimal]:
-        sentence = "a comma cannot be both the decimal mark and the separator; correct one"
+        sentence = "a comma cannot be both the decimal mark and the separator. Correct one"
         raise file.error(sentence, ("decimal",))
     if record.skip < 0:
-        raise file.error(f"'skip' is {record.skip}; write a number of lines, 0 or more", ("skip",))
+        raise file.error(f"'skip' is {record.skip}. Write a number of lines, 0 or more", ("skip",))
     if record.comment == "":
-        raise file.error("'comment' is empty; write the start of a comment line", ("comment",))
+        raise file.error("'comment' is empty. Write the start of a comment line", ("comment",))
     if record.ignore is not None:
         refuse_pattern(file, record.ignore, ("ignore",))
     try:
         "".encode(codecs.lookup(record.encoding).name)  # refuses codecs not of text, such as hex
     except (LookupError, ValueError):
         sentence = f"{record.encoding!r} is not a known encoding"
-        act = "write utf-8, utf-16, latin-1 or cp1252"
-        raise file.error(f"{sentence}; {act}", ("encoding",)) from None
+        act = "Write utf-8, utf-16, latin-1 or cp1252"
+        raise file.error(f"{sentence}. {act}", ("encoding",)) from None
     profile = Profile(file, record, kind)
     if "matrix" in file.content:
         places = record.matrix
@@ -354,7 +354,7 @@ def read_profile(path: str | Path) -> Profile:
         is_quaternion = is_pose and getattr(kind, "orientation", None) == "quaternion"
         if len(places) != 9 or not is_quaternion:
             sentence = "a matrix has nine columns, row by row, and needs 'kind: pose, orientation:"
-            raise file.error(f"{sentence} quaternion'; correct it", ("matrix",))
+            raise file.error(f"{sentence} quaternion'. Correct it", ("matrix",))
     check_columns(profile)
     return profile
 
@@ -379,7 +379,7 @@ def check_columns(profile: Profile) -> None:
     measured = profile.measured[-3:] if record.matrix else profile.measured
     dimensions = _list_dimensions(profile)
     subject = (
-        "a table of readings (no kind is stated)"
+        "a table of readings (without a kind)"
         if profile.kind is None
         else f"measurement files of the kind {profile.kind.name!r}"
     )
@@ -390,31 +390,31 @@ def check_columns(profile: Profile) -> None:
         is_noise = name.startswith((SIGMA, COVARIANCE))
         allowed, plain = (noise, name.replace(MEASURED, "")) if is_noise else (known, name)
         if plain not in allowed and not is_context(name) and not name.startswith(NOTE):
-            hint = suggest_names(name, allowed) or f"; allowed: {', '.join(allowed)}"
+            hint = suggest_names(name, allowed) or f". Allowed: {', '.join(allowed)}"
             sentence = f"{name!r} is not a column of {subject}"
             raise file.error(f"{sentence}{hint}", ("columns", name))
         _check_source(file, name, source, ("columns", name), dimensions)
     for name, source in record.readings.items():
         if name in record.columns:
-            act = f"name the measured one {MEASURED + name!r} under 'columns'"
+            act = f"Name the measured one {MEASURED + name!r} under 'columns'"
             raise file.error(
-                f"{name!r} is a reading and a measured column; {act}", ("readings", name)
+                f"{name!r} is a reading and a measured column. {act}", ("readings", name)
             )
         _check_source(file, name, source, ("readings", name), {})
     for name in measured:
         count = sum(column in record.columns for column in (name, MEASURED + name))
         if count != 1:
             sentence = (
-                f"'columns' states {count} sources of {name!r}, but one is needed in {subject}"
+                f"'columns' gives {count} sources of {name!r}, but one is needed in {subject}"
             )
-            raise file.error(f"{sentence}; correct it", ("columns",))
+            raise file.error(f"{sentence}. Correct it", ("columns",))
     pattern = record.columns["pose"].pattern if "pose" in record.columns else None
     has_target = "" not in profile.columns_by_target  # each line has the columns of all
     has_target |= pattern is not None and "target" in pattern.groupindex
     if len(profile.targets) > 1 and not has_target:
-        sentence = "the kind has several targets, each with a line of its own"
-        act = "add (?P<target>..) to 'match' of 'pose', or {target} to names in 'from'"
-        raise file.error(f"{sentence}; {act}", ("columns", "pose"))
+        sentence = "the kind has several targets, each with a separate line"
+        act = "Add (?P<target>..) to 'match' of 'pose', or {target} to names in 'from'"
+        raise file.error(f"{sentence}. {act}", ("columns", "pose"))
 
 
 def _list_dimensions(profile: Profile) -> dict[str, tuple[Dimension, ...]]:
@@ -441,11 +441,11 @@ def _check_source(
     has_unit = source.unit is not None
     is_text = name in TEXTS or name.startswith(NOTE) or (name == TIME and not has_unit)
     if is_text and has_unit:
-        raise file.error(f"{name!r} is text and has no unit; remove 'unit'", place)
+        raise file.error(f"{name!r} is text and has no unit. Remove 'unit'", place)
     if not is_text and not has_unit:
-        raise file.error(f"{name!r} has no unit; add 'unit'", place)
+        raise file.error(f"{name!r} has no unit. Add 'unit'", place)
     if len(source.places) > 1 and not is_text:
-        raise file.error(f"{name!r} is a number and has one source; name one column", place)
+        raise file.error(f"{name!r} is a number and has one source. Name one column", place)
     if source.symbol is not None:
         unit_place = (*place, "unit")
         wanted = dimensions.get(name.replace(MEASURED, ""), ())
@@ -456,24 +456,24 @@ def _check_source(
         known = {*list_symbols(), *TIME_UNITS, *TEMPERATURE_UNITS} - {"1"}
         if stated != source.symbol and stated in known:
             sentence = f"the export's header is {header!r}, but the unit here is {source.symbol!r}"
-            act = f"write the unit {stated}, or name the column by its place"
-            raise file.error(f"{sentence}; {act}", unit_place)
+            act = f"Write the unit {stated}, or name the column by its place"
+            raise file.error(f"{sentence}. {act}", unit_place)
     _check_scale(file, name, source, place)
     for key, value, owner in (("match", source.match, "pose"), ("format", source.format, TIME)):
         if value is not None and (name != owner or not is_text):
-            sentence = f"{key!r} belongs to {owner!r}, not to {name!r}; remove it"
+            sentence = f"{key!r} belongs to {owner!r}, not to {name!r}. Remove it"
             raise file.error(sentence, (*place, key))
     if source.format is not None:
         try:
             datetime.strptime(SOME_TIME.strftime(source.format), source.format)
         except (ValueError, re.error):  # strptime makes a regular expression of it
             sentence = f"{quote(source.format)} is not a format of times"
-            act = "write each of its parts once, such as '%d.%m.%Y %H:%M:%S'"
-            raise file.error(f"{sentence}; {act}", (*place, "format")) from None
+            act = "Write each of its parts once, such as '%d.%m.%Y %H:%M:%S'"
+            raise file.error(f"{sentence}. {act}", (*place, "format")) from None
     if source.match is not None:
         refuse_pattern(file, source.match, (*place, "match"))
         if source.pattern is None or "pose" not in source.pattern.groupindex:
-            sentence = "this pattern finds no pose; put its part of the name in (?P<pose>..)"
+            sentence = "this pattern finds no pose. Put its part of the name in (?P<pose>..)"
             raise file.error(sentence, (*place, "match"))
 
 
@@ -485,12 +485,12 @@ def _check_scale(file: YamlFile, name: str, source: ColumnSource, place: Locatio
                 report_finding("files.not-a-sigma", key=key, column=name), (*place, key)
             )
     if not (source.factor > 0.0 and math.isfinite(source.factor)):
-        sentence = f"'factor' is {source.factor:g}; write a positive number, such as 0.5 for U(k=2)"
+        sentence = f"'factor' is {source.factor:g}. Write a positive number, such as 0.5 for U(k=2)"
         raise file.error(sentence, (*place, "factor"))
     if source.floor is not None and source.symbol is not None:
         dimension = find_unit(source.symbol).dimension
         if not file.quantity(source.floor, dimension, (*place, "floor")) > 0.0:
-            sentence = f"'floor' is {source.floor}; write a positive quantity, such as 1 um"
+            sentence = f"'floor' is {source.floor}. Write a positive quantity, such as 1 um"
             raise file.error(sentence, (*place, "floor"))
 
 
@@ -501,7 +501,7 @@ def _check_unit(
     if is_context(name):
         known = TIME_UNITS if name == TIME else TEMPERATURE_UNITS
         if symbol not in known:
-            sentence = f"{symbol!r} is not a unit of {name!r}; allowed: {', '.join(known)}"
+            sentence = f"{symbol!r} is not a unit of {name!r}. Allowed: {', '.join(known)}"
             raise file.error(sentence, place)
         return
     factors = [part.strip() for part in symbol.split("*")]
@@ -509,7 +509,7 @@ def _check_unit(
     if len(factors) != len(needed):
         example = "*".join("mm" for _ in needed)
         raise file.error(
-            f"{symbol!r} is not a unit of {name!r}; write a unit such as {example}", place
+            f"{symbol!r} is not a unit of {name!r}. Write a unit such as {example}", place
         )
     for factor, dimension in zip(factors, needed, strict=True):
         try:
@@ -523,9 +523,9 @@ def _check_places(file: YamlFile, places: Sequence[Place], location: Location) -
     for place in places:
         if place == "" or (isinstance(place, int) and place < 1):
             sentence = f"{place!r} is neither a name in the export's header nor a place from 1"
-            raise file.error(f"{sentence}; correct it", location)
+            raise file.error(f"{sentence}. Correct it", location)
     if not places:
-        sentence = "no column is named; write a name in the export's header or a place from 1"
+        sentence = "no column is named. Write a name in the export's header or a place from 1"
         raise file.error(sentence, location)
 
 

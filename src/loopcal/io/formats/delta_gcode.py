@@ -101,7 +101,7 @@ COMMENTS = {
     "angles": "of the towers; the third defines the x axis and stays fixed",
     "stops": "height of the nozzle, in the center, with the carriage at its end stop",
     "readings": "carriage positions count down from the end stops",
-    "workspace": "assumed; replace by the real workspace",
+    "workspace": "assumed. Replace by the real workspace",
     "tolerances": "measured by hand: prior knowledge",
     "fixed": "heights alone do not determine the arms; distances do",
 }
@@ -117,7 +117,7 @@ def format_robot(
     """
     if not min(geometry.arms) > geometry.radius > 0:
         sentence = f"the delta radius is {geometry.radius:g} mm and the shortest arm"
-        act = "the radius must be positive and every arm longer than it; correct them"
+        act = "the radius must be positive and every arm longer than it. Correct them"
         raise FileError(f"{sentence} {min(geometry.arms):g} mm; {act}", path)
     half = round_length(0.5 * geometry.radius)
     content: dict[str, Any] = {
@@ -179,7 +179,7 @@ class GcodeFile(ValueFile):
     commands: Mapping[str, tuple[int, int]]
 
     what = "G-code file"
-    missing = "{0} has no {1}; write it as {0} {1}.."
+    missing = "{0} has no {1}. Write it as {0} {1}.."
 
     @classmethod
     def parse(cls, lines: Sequence[str], path: Path, is_one_in_a_line: bool = False) -> GcodeFile:
@@ -195,13 +195,13 @@ class GcodeFile(ValueFile):
                     continue
                 if position and is_one_in_a_line:
                     sentence = f"{command} is not the first command of this line"
-                    raise FileError(f"{sentence}; move it to its own line", path, i + 1)
+                    raise FileError(f"{sentence}. Move it to its own line", path, i + 1)
                 if rest:
                     sentence = f"{command} has {quote(rest)}, but a letter and its number are"
-                    raise FileError(f"{sentence} needed; correct it", path, i + 1)
+                    raise FileError(f"{sentence} needed. Correct it", path, i + 1)
                 for k, (letter, start, length) in enumerate(letters):
                     if any(letter == other for other, *_ in letters[:k]):
-                        raise FileError(f"{command} has {letter} twice; remove one", path, i + 1)
+                        raise FileError(f"{command} has {letter} twice. Remove one", path, i + 1)
                     words[command, letter] = Value(line[start : start + length], i, start)
         return cls(path, tuple(lines), words, commands)
 
@@ -306,7 +306,7 @@ class DeltaFirmware(ABC):
             sentence = "no M665, the geometry of a delta, in this file; print it by M503"
             raise FileError(sentence, path)
         if "G20" in file.commands:
-            sentence = "G20 selects inches; write the geometry in millimeters"
+            sentence = "G20 selects inches. Write the geometry in millimeters"
             raise FileError(sentence, path, file.commands["G20"][0] + 1)
         program, format_name, commands = self.others
         known = ((c, file.commands[c][0]) for c in commands if c in file.commands)
@@ -405,11 +405,11 @@ class Marlin(DeltaFirmware):
         """Refuse a single trim B, and positive adjustments."""
         if [letter for letter in TRIMS if file.has("M665", letter)] == ["B"]:
             sentence = "M665 B without A and C is a radius in older Marlin and a rod trim in newer"
-            raise file.error(f"{sentence}; remove it, or write all three", "M665", "B")
+            raise file.error(f"{sentence}. Remove it, or write all three", "M665", "B")
         for tower in TOWERS:
             if (adjustment := file.number("M666", tower, 0.0)) > 0:
                 sentence = f"M666 {tower} is {adjustment:g}, but is never positive in Marlin"
-                act = "(in RepRapFirmware it may be); correct it"
+                act = "(in RepRapFirmware it may be). Correct it"
                 raise file.error(f"{sentence} {act}", "M666", tower)
 
     def parse_arms(self, file: GcodeFile) -> Triple:
@@ -454,14 +454,14 @@ class RepRapFirmware(DeltaFirmware):
         for letter in "AB":
             if file.number("M666", letter, 0.0) != 0.0:
                 sentence = f"M666 {letter} tilts the bed, which a robot of the family linear-delta"
-                raise file.error(f"{sentence} lacks; set it to 0 and probe again", "M666", letter)
+                raise file.error(f"{sentence} lacks. Set it to 0 and probe again", "M666", letter)
 
     def parse_arms(self, file: GcodeFile) -> Triple:
         """Return the lengths of L; the firmware uses the first for those that are left out."""
         lengths = file.numbers("M665", "L", ":")
         if len(lengths) > len(TOWERS):
             sentence = f"L of M665 has {len(lengths)} lengths, but a delta of loopcal has three"
-            raise file.error(f"{sentence} towers; remove the others", "M665", "L")
+            raise file.error(f"{sentence} towers. Remove the others", "M665", "L")
         return lengths + lengths[:1] * (3 - len(lengths))
 
     def list_arms(self, arms: Triple, is_new: bool) -> tuple[Words, tuple[Finding, ...]]:

@@ -54,7 +54,7 @@ def read_stops(path: str | Path, robot: Mechanism) -> Stops:
     path = Path(path)
     file = path / SHEET if path.is_dir() else path
     table = read_table(file)
-    why = f"a coordinate of {robot.name}; name the folder of a plan, or its {SHEET}"
+    why = f"a coordinate of {robot.name}. Name the folder of a plan, or its {SHEET}"
     require_columns(table, ("pose", USE_COLUMN.name, *robot.controlled), why)
     uses = table.text(USE_COLUMN.name)
     for row, use in enumerate(uses):
@@ -84,7 +84,7 @@ def format_gcode(
 
     def format_positive(name: str, value: float, unit: str) -> str:
         if not 0.0 < round(value, SETTING_DECIMALS) < math.inf:
-            sentence = f"the {name} is {value:g} {unit}; give a finite number"
+            sentence = f"the {name} is {value:g} {unit}. Give a finite number"
             raise DataError(f"{sentence} of at least {10.0**-SETTING_DECIMALS:g} {unit}")
         return format_short(value, SETTING_DECIMALS)
 

@@ -77,7 +77,7 @@ DIGITS = 12
 
 COMMENTS = {
     "parameters": "of the spools; buildup: growth of radius^2 for each length that is wound",
-    "workspace": "assumed; replace by the real workspace",
+    "workspace": "assumed. Replace by the real workspace",
 }
 
 
@@ -132,18 +132,18 @@ def read_config(file: ValueFile, options: ImportOptions) -> Imported:
         numbers = file.numbers(command, letter, ":")
         if len(numbers) != count:
             sentence = f"{letter} of {command} has {len(numbers)} numbers, but {count} are needed"
-            raise file.error(f"{sentence}; correct it", command, letter)
+            raise file.error(f"{sentence}. Correct it", command, letter)
         return numbers
 
     lines = int(file.number("M669", "N", 4.0))
     if not FREEDOMS <= lines <= len(ANCHORS_OF_FIRMWARE):
-        raise file.error(f"N is {lines}; write a number of 3 to 8 lines", "M669", "N")
+        raise file.error(f"N is {lines}. Write a number of 3 to 8 lines", "M669", "N")
     anchors = np.array([list_numbers("M669", name, 3) for name in ANCHORS_OF_FIRMWARE[:lines]])
     radius, advantage, per_spool, motor, spool = (
         np.array(list_numbers("M666", letter, lines)) for letter in "RUOLH"
     )
     if not (np.array([radius, advantage, per_spool, motor, spool]) > 0).all():
-        raise file.error("R, U, O, L and H of M666 must be positive; correct them", "M666", "R")
+        raise file.error("R, U, O, L and H of M666 must be positive. Correct them", "M666", "R")
     gear, nothing = float(motor[0] / spool[0]), np.full(lines, np.nan)
     spools = (radius * motor / spool / gear, advantage, per_spool, gear)
     samples = Samples(*spools, np.zeros((0, lines)), np.zeros((0, 3)), anchors, nothing, ())
@@ -158,7 +158,7 @@ def write(source: ExportSource, into: Path | None) -> Exported:
     lines = [name.removesuffix(ending) for name in values if name.endswith(ending)]
     if not FREEDOMS <= len(lines) <= len(ANCHORS_OF_FIRMWARE):
         sentence = f"{source.robot.name} has no anchors of lines, and the format hangprinter"
-        raise DataError(f"{sentence} holds no other; use json or csv")
+        raise DataError(f"{sentence} holds no other. Use json or csv")
     words = [f"M669 K6 N{len(lines)}"]
     for line, letter in zip(lines, ANCHORS_OF_FIRMWARE, strict=False):
         names = [f"{line}.anchor.{axis}" for axis in "xyz"]
@@ -223,7 +223,7 @@ def parse(path: Path) -> Samples:
         known = _parse_numbers(content, POSITIONS, path, 2, FREEDOMS)
     if len(known) > len(motors):
         sentence = f"{POSITIONS!r} has {len(known)} poses, but {SAMPLES!r} only {len(motors)}"
-        raise FileError(f"{sentence}; remove the others", path)
+        raise FileError(f"{sentence}. Remove the others", path)
     motor_teeth, spool_teeth = (_parse_numbers(content, key, path, 0) for key in TEETH)
     radius, advantage, per_spool = (_parse_numbers(content, key, path, 1, lines) for key in SPOOLS)
     anchors = None
@@ -231,7 +231,7 @@ def parse(path: Path) -> Samples:
         anchors = _parse_numbers(content, ANCHORS, path, 2, FREEDOMS)
         if len(anchors) != lines:
             sentence = f"{ANCHORS!r} has {len(anchors)} rows, but there are {lines} lines"
-            raise FileError(f"{sentence}; write one row for each", path)
+            raise FileError(f"{sentence}. Write one row for each", path)
     gear, taped = float(motor_teeth / spool_teeth), _parse_taped(content, path, lines)
     spools, findings = (radius, advantage, per_spool, gear), tuple(_report_ignored(content))
     return Samples(*spools, motors * DEG, known, anchors, taped, findings)
@@ -260,10 +260,10 @@ def estimate_anchors(samples: Samples, path: Path) -> FloatArray:
     from loopcal.geometry import ANCHOR_RANK, solve_line_anchor
 
     act = (
-        f"add known poses at several heights to {POSITIONS!r} (mm), or add the key {ANCHORS!r} (mm)"
+        f"Add known poses at several heights to {POSITIONS!r} (mm), or add the key {ANCHORS!r} (mm)"
     )
     if not len(samples.known):
-        raise FileError(f"no pose is known; {act}", path)
+        raise FileError(f"no pose is known. {act}", path)
     extensions = samples.motors[: len(samples.known)] * samples.gain
     anchors = []
     for i, (name, extension) in enumerate(zip(samples.names, extensions.T, strict=True)):
@@ -272,7 +272,7 @@ def estimate_anchors(samples: Samples, path: Path) -> FloatArray:
             sentence = f"the {len(samples.known)} known poses do not determine the anchor of line"
             values = ", ".join(f"{value:.3g}" for value in s)
             reason = f"rank {rank} of {ANCHOR_RANK}, singular values {values}"
-            raise FileError(f"{sentence} {name} ({reason}); {act}", path)
+            raise FileError(f"{sentence} {name} ({reason}). {act}", path)
         if samples.is_taped[i]:
             length = float(np.linalg.norm(anchor))
             if not 1.0 / FAR_OFF < samples.taped[i] / length < FAR_OFF:
@@ -399,7 +399,7 @@ def _parse_numbers(
     wanted = ("a number", "a list of numbers", "a list of rows of numbers")[ndim]
     wanted += "" if width is None else f", {width} in {'all' if ndim == 1 else 'each'}"
     if key not in content:
-        raise FileError(f"the key {key!r} is missing; add {wanted}", path)
+        raise FileError(f"the key {key!r} is missing. Add {wanted}", path)
     rows = content[key]
     if ndim == 2 and isinstance(rows, list) and all(isinstance(row, list) for row in rows):
         lengths = [len(row) for row in rows]
@@ -412,12 +412,12 @@ def _parse_numbers(
     cells = np.array(rows, dtype=object)
     has_shape = cells.ndim == ndim and cells.size and width in (None, *cells.shape[-1:])
     if not has_shape or not all(map(_is_number, cells.flat)):
-        raise FileError(f"{key!r} is not {wanted}; correct it", path)
+        raise FileError(f"{key!r} is not {wanted}. Correct it", path)
     values = cells.astype(float)
     if not (np.abs(values) <= LARGEST).all():
-        raise FileError(f"{key!r} contains a number beyond {LARGEST:g}; correct it", path)
+        raise FileError(f"{key!r} contains a number above {LARGEST:g}. Correct it", path)
     if key in (*TEETH, *SPOOLS) and not (values > 0).all():
-        raise FileError(f"{key!r} is {content[key]}; write positive numbers", path)
+        raise FileError(f"{key!r} is {content[key]}. Write positive numbers", path)
     return values
 
 

@@ -76,13 +76,13 @@ class KlipperConfig(ValueFile):
         """Return the sentence about an option that does not exist."""
         files = ", ".join(self.includes)
         hint = f" (if {files} contains it, move it into this file)" if files else ""
-        return f"option {name!r} of [{group}] is missing{hint}; add it"
+        return f"option {name!r} of [{group}] is missing{hint}. Add it"
 
     def positive(self, section: str, option: str, default: float | None = None) -> float:
         """Return a positive number of an option, or the default; FileError for another."""
         value = self.number(section, option, default)
         if not value > 0:
-            sentence = f"{option!r} of [{section}] is {value:g}; write a positive number"
+            sentence = f"{option!r} of [{section}] is {value:g}. Write a positive number"
             raise self.error(sentence, section, option)
         return value
 
@@ -102,7 +102,7 @@ class KlipperConfig(ValueFile):
             if header is not None and i >= header:
                 if not line.startswith(MARK) or line[3:4] not in ("", " ", "\n", "\r"):
                     sentence = f"this line below SAVE_CONFIG has no {MARK!r}, so Klipper ignores"
-                    raise FileError(f"{sentence} the block; move it up", path, i + 1)
+                    raise FileError(f"{sentence} the block. Move it up", path, i + 1)
                 offset = 4
             content = COMMENT.sub("", line[offset:].rstrip("\r\n")).rstrip()
             if not content or content[0].isspace():
@@ -219,7 +219,7 @@ def get_step_distance(cfg: KlipperConfig, section: str) -> float:
         teeth = [parse_finite(part.strip()) or 0.0 for part in pair.split(":")]
         ratio *= teeth[0] / teeth[1] if len(teeth) == 2 and teeth[1] else 0.0
     if not ratio > 0:
-        sentence = f"gear_ratio is {text!r}; write it as 80:16, or 57:11, 2:1 for several gears"
+        sentence = f"gear_ratio is {text!r}. Write it as 80:16, or 57:11, 2:1 for several gears"
         raise cfg.error(sentence, section, "gear_ratio")
     return rotation / (steps * ratio)
 
@@ -253,7 +253,7 @@ def _parse_steps(cfg: KlipperConfig, option: str) -> tuple[float, ...]:
     steps = cfg.numbers(PROBED, option, ",")
     if len(steps) != len(STEPPERS):
         sentence = f"{option!r} of [{PROBED}] has {len(steps)} numbers, but three are needed"
-        raise cfg.error(f"{sentence}, the steps of the towers; correct it", PROBED, option)
+        raise cfg.error(f"{sentence}, the steps of the towers. Correct it", PROBED, option)
     return steps
 
 

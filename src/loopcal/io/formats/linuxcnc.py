@@ -63,7 +63,7 @@ class HalFile(ValueFile):
 
     what = "HAL file"
     title = phrase = "{0}.{1}"
-    missing = "'setp {0}.{1} ..' is missing, and loopcal assumes no default; add it"
+    missing = "'setp {0}.{1} ..' is missing, and loopcal assumes no default. Add it"
     group = COMPONENT
     entry: ClassVar[re.Pattern[str]] = re.compile(
         rf"\s*setp\s+{COMPONENT}\.([\w.-]+)(?:\s*=\s*|\s+)([^\s#]+)"
@@ -171,7 +171,7 @@ def _list_pins(
         lead = abs(legs[0].lead) if present is None else math.copysign(legs[0].lead, present)
         if any(abs(abs(leg.lead) - abs(lead)) > ROUNDING * abs(lead) for leg in legs):
             sentence = f"{source.robot.name} has screws of different lead, but genhexkins has one"
-            raise DataError(f"{sentence} lead; use json or csv")
+            raise DataError(f"{sentence} lead. Use json or csv")
         pins[LEAD] = lead / factor
         for n, leg in enumerate(legs):
             sign = math.copysign(1.0, leg.lead * lead)
@@ -206,7 +206,7 @@ def _read_hal(path: Path) -> HalFile:
     hal = HalFile.load(path)
     if not hal.values:
         sentence = f"this file has no 'setp {COMPONENT}...'"
-        raise FileError(f"{sentence}; name the HAL file that sets the geometry", path)
+        raise FileError(f"{sentence}. Name the HAL file that sets the geometry", path)
     return hal
 
 
@@ -235,7 +235,7 @@ class IniFile(ValueFile):
     what = "INI file"
     title = "[{0}]{1}"
     phrase = "{1} of [{0}]"
-    missing = "[{0}] has no {1}; add the one of the machine"
+    missing = "[{0}] has no {1}. Add the one of the machine"
     section: ClassVar[re.Pattern[str] | None] = re.compile(r"\s*\[(\w+)\]")
     entry: ClassVar[re.Pattern[str]] = re.compile(r"\s*(\w+)\s*=\s*([^\s#;]+)")
     new = "[{0}]\n{1} = {2}"
@@ -257,7 +257,7 @@ def write_ini(source: ExportSource, into: Path | None) -> Exported:
         text, findings = ini.text(*UNITS_NAME), []
         if text.lower() not in LINEAR_UNITS:
             allowed = ", ".join(LINEAR_UNITS)
-            raise ini.error(f"{UNITS_NAME[1]} is {text!r}; allowed: {allowed}", *UNITS_NAME)
+            raise ini.error(f"{UNITS_NAME[1]} is {text!r}. Allowed: {allowed}", *UNITS_NAME)
         unit = LINEAR_UNITS[text.lower()]
     factor = find_unit(unit).factor_to_si
 

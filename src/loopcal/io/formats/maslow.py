@@ -141,7 +141,7 @@ def write(source: ExportSource, into: Path | None) -> Exported:
         for axis in "xy":
             if (name := f"{belt}.anchor.{axis}") not in values:
                 sentence = f"{source.robot.name} has no {name}, and the format maslow holds no"
-                raise DataError(f"{sentence} other robot; use json or csv")
+                raise DataError(f"{sentence} other robot. Use json or csv")
             number = source.round_number(values[name] / MM, name, MM, 3)
             wanted["Maslow", belt + axis.upper()] = number
     return file.export(into, wanted, {})

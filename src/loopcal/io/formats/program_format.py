@@ -185,7 +185,7 @@ def get_record(
     record = getattr(source.robot.record, "record", None)
     if not isinstance(record, family):
         sentence = f"{source.robot.name} is not {needed}, and the format {format_name} holds no"
-        raise DataError(f"{sentence} other; use json or csv")
+        raise DataError(f"{sentence} other. Use json or csv")
     return record
 
 
@@ -211,7 +211,7 @@ def parse_number(text: str, what: str, path: Path, line: int) -> float:
     if value is not None and abs(value) <= LARGEST:
         return value
     reason = ", but a finite number is needed" if value is None else f", beyond {LARGEST:g}"
-    raise FileError(f"{what} is {quote(text)}{reason}; correct it", path, line)
+    raise FileError(f"{what} is {quote(text)}{reason}. Correct it", path, line)
 
 
 def report_changes(changes: Sequence[Finding]) -> tuple[Finding, ...]:

@@ -115,8 +115,8 @@ def refuse_impossible_values(file: YamlFile, robot: Mechanism, values: FloatArra
     for name, finding in find_impossible_values(robot, values)[:1]:
         rows = [row.get("name") for row in file.content[TABLE]]
         place: Location = (TABLE, rows.index(name)) if name in rows else (TABLE,)
-        advice = "correct the value, or delete this table to restore the nominal robot"
-        raise file.error(f"{finding}; {advice}", place)
+        advice = "Correct the value, or delete this table to restore the nominal robot"
+        raise file.error(f"{finding}. {advice}", place)
 
 
 def read_rows(file: YamlFile, robot: Mechanism) -> dict[str, float]:
@@ -128,19 +128,19 @@ def read_rows(file: YamlFile, robot: Mechanism) -> dict[str, float]:
     for i, row in enumerate(rows):
         place: Location = (TABLE, i)
         if not isinstance(row, dict):
-            raise file.error(f"this row is not a mapping; write {EXAMPLE}", place)
+            raise file.error(f"this row is not a mapping. Write {EXAMPLE}", place)
         refuse_unknown_keys(file, list(row), KEYS, place)
         for key in (k for k in KEYS if k != PLUS_MINUS and k not in row):
-            raise file.error(f"this row has no {key!r}; write {EXAMPLE}", place)
+            raise file.error(f"this row has no {key!r}. Write {EXAMPLE}", place)
         name, value, symbol = row["name"], row["value"], row["unit"]
         if name not in robot.parameters.names:
             hint = suggest_names(str(name), robot.parameters.names)
-            sentence = f"{name!r} is not a parameter of this robot{hint}; correct the name"
+            sentence = f"{name!r} is not a parameter of this robot{hint}. Correct the name"
             raise file.error(sentence, place)
         if name in values:
-            raise file.error(f"duplicate parameter {name!r}; remove one", place)
+            raise file.error(f"duplicate parameter {name!r}. Remove one", place)
         if isinstance(value, bool) or not isinstance(value, int | float):
-            raise file.error(f"the value of {name!r} is {value!r}; write a number", place)
+            raise file.error(f"the value of {name!r} is {value!r}. Write a number", place)
         dimension = robot.parameters.dimensions[robot.parameters.index(name)]
         try:
             values[name] = to_si(value, find_unit(str(symbol), dimension))
@@ -243,7 +243,7 @@ def save_robot(robot: Mechanism, path: str | Path, plus_minus: FloatArray | None
     path, count = as_path(path, WHAT), len(robot.parameters.names)
     if plus_minus is not None and np.shape(plus_minus) != (count,):
         raise DataError(
-            f"plus_minus has shape {np.shape(plus_minus)}; give one uncertainty for each of the "
+            f"plus_minus has shape {np.shape(plus_minus)}. Give one uncertainty for each of the "
             f"{count} parameters, such as fit.plus_minus"
         )
     write_text(path, format_robot(robot, plus_minus))
@@ -266,7 +266,7 @@ def get_source(robot: Mechanism) -> RobotSource:
     """Return the origin of a robot; raise MechanismError where it was not loaded from a file."""
     if not isinstance(robot.record, RobotSource):
         sentence = f"{robot.name} was not loaded from a robot file and has no text to write"
-        raise MechanismError(f"{sentence}; use load_robot")
+        raise MechanismError(f"{sentence}. Use load_robot")
     return robot.record
 
 
@@ -298,12 +298,12 @@ def check_format(file: YamlFile, newest: int) -> None:
     """Raise FileError for a file without `format:`, or with a newer format than `newest`."""
     stated, place = file.content.get("format"), ("format",)
     if "format" not in file.content:
-        raise file.error(f"this file states no format; begin it with 'format: {newest}'")
+        raise file.error(f"this file has no format. Begin it with 'format: {newest}'")
     if not isinstance(stated, int) or isinstance(stated, bool) or stated < 1:
-        raise file.error(f"'format' is {stated!r}; write 'format: {newest}'", place)
+        raise file.error(f"'format' is {stated!r}. Write 'format: {newest}'", place)
     if stated > newest:
         sentence = f"this file has format {stated}, but this loopcal reads formats up to {newest}"
-        raise file.error(f"{sentence}; use a newer loopcal", place)
+        raise file.error(f"{sentence}. Use a newer loopcal", place)
 
 
 def _read_family(file: YamlFile, known: Sequence[str]) -> str:
@@ -314,12 +314,12 @@ def _read_family(file: YamlFile, known: Sequence[str]) -> str:
             return KEY
         for key in file.content:
             if suggestion := suggest_names(key, ["family"]):
-                raise file.error(f"unknown key {key!r}{suggestion}; correct it", (key,))
-        sentence = "this file names no family; write 'family:' and one of"
+                raise file.error(f"unknown key {key!r}{suggestion}. Correct it", (key,))
+        sentence = "this file names no family. Write 'family:' and one of"
         raise file.error(f"{sentence} {', '.join(known)}")
     if family not in known:
         sentence = f"{family!r} is not a family of robots{suggest_names(str(family), known)}"
-        raise file.error(f"{sentence}; allowed: {', '.join(known)}", ("family",))
+        raise file.error(f"{sentence}. Allowed: {', '.join(known)}", ("family",))
     return str(family)
 
 
@@ -370,7 +370,7 @@ def place_stages(file: YamlFile, chain: RobotRecord, units: Units) -> RobotRecor
         content: dict[str, Any] = file.content[KEY][i]
         if (stage.joint is None) == (stage.family is None):
             states = "neither 'joint' nor" if stage.joint is None else "both 'joint' and"
-            sentence = f"stage {stage.name!r} states {states} 'family'; write 'joint:' for a serial"
+            sentence = f"stage {stage.name!r} states {states} 'family'. Write 'joint:' for a serial"
             act = "joint, or 'family:' with the keys of that family"
             raise file.error(f"{sentence} {act}", (KEY, i))
         if stage.family is None:
@@ -381,7 +381,7 @@ def place_stages(file: YamlFile, chain: RobotRecord, units: Units) -> RobotRecor
             hint = suggest_names(stage.family, list(families))
             sentence = f"{stage.family!r} is not a family of a stage{hint}"
             allowed = ", ".join(sorted(families))
-            raise file.error(f"{sentence}; allowed: {allowed}", (KEY, i, "family"))
+            raise file.error(f"{sentence}. Allowed: {allowed}", (KEY, i, "family"))
         rest = {key: value for key, value in content.items() if key not in OWN_KEYS}
         robots.append(read_record(file, rest, families[stage.family], units, (KEY, i)))
     own = {field.name: getattr(chain, field.name) for field in fields(chain)}
@@ -409,7 +409,7 @@ def load_stored_values(path: str | Path, robot: Mechanism) -> dict[str, float] |
         return build_robot(file)
     if TABLE not in file.content:
         raise file.error(
-            f"neither a robot file nor a list of values; write a list {TABLE!r} of {EXAMPLE}"
+            f"neither a robot file nor a list of values. Write a list {TABLE!r} of {EXAMPLE}"
         )
     refuse_unknown_keys(file, list(file.content), (TABLE,))
     return read_rows(file, robot)
@@ -541,7 +541,7 @@ def format_new_robot(family: str, name: str) -> str:
         known = list(dict.fromkeys([*FAMILIES, *shipped]))
         sentence = f"{family!r} is neither a family nor a shipped robot"
         hint = suggest_names(family, known)
-        raise MechanismError(f"{sentence}{hint}; allowed: {', '.join(known)}")
+        raise MechanismError(f"{sentence}{hint}. Allowed: {', '.join(known)}")
     text = shipped[example].read_text("utf-8")
     record = str(read_yaml(shipped[example], "robot file").content["family"])
     for key, value in (("name", quote_scalar(name)), ("source", "where these numbers come from")):

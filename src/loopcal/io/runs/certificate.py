@@ -93,7 +93,7 @@ class _Texts:
             value = getattr(self, field.name)
             is_right, form = FORMS.get(field.name, (bool, ""))
             if form and value and not is_right(value):
-                raise ValueError(f"{field.name} is {value!r}; write {form}")
+                raise ValueError(f"{field.name} is {value!r}. Write {form}")
 
 
 @dataclass(frozen=True)
@@ -170,7 +170,7 @@ class Administration(_Texts):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.begin and self.end and self.end < self.begin:
-            raise ValueError(f"end is {self.end}, before begin, {self.begin}; correct one")
+            raise ValueError(f"end is {self.end}, before begin, {self.begin}. Correct one")
 
     def list_rows(self) -> dict[str, str]:
         """Return what a report shows, by the words that people read; a missing text is empty."""
@@ -208,7 +208,7 @@ def load_administration(path: str | Path, is_complete: bool = True) -> Administr
         for step in location:
             text = getattr(text, step) if isinstance(step, str) else (text or (Person(),))[step]
         if not text.strip():
-            raise file.error(f"{name_location(location)!r} is empty; fill it in", location)
+            raise file.error(f"{name_location(location)!r} is empty. Fill it in", location)
     return facts
 
 
@@ -220,12 +220,11 @@ PROBABILITY = 0.95
 
 SCOPE = (
     "The results concern the geometry in the region and under the conditions of the measured "
-    "poses. They do not cover errors that did not act during the measurement, such as those of "
-    "other loads, temperatures or speeds."
+    "poses. They rest on the expected spreads as a prior, and do not cover influences outside the "
+    "measurement, such as other loads, temperatures or speeds."
 )
 PREDICTED = (
-    "The error is that of predicted poses at the recorded readings, without the noise of the "
-    "measurement."
+    "The errors are of predicted poses at the recorded readings, without the measurement noise."
 )
 """What the results and the statements on limits are about."""
 
@@ -266,7 +265,7 @@ def format_certificate(run: Run, administration: Administration) -> str:
     FileError : `files.run-changed`.
     """
     if not run.result:
-        raise DataError(f"{run.path} is a robot file, which states no result; give a run folder")
+        raise DataError(f"{run.path} is a robot file, which has no result. Give a run folder")
     if run.failure is not None:
         raise DataError(run.failure)
     refuse_changed_run(run)
@@ -557,8 +556,8 @@ def _list_statements(content: Mapping[str, Any]) -> Iterator[Content]:
         )
         probability = conformity_probability({"most_probable": stated["probability"], **stated})
         declaration = (
-            f"{', '.join(lengths)}, probability of conformity {probability}; "
-            f"conformity and nonconformity are stated from {100 * stated['level']:.3g} %. {meaning}"
+            f"{', '.join(lengths)}, probability of conformity {probability}. Decisions need a "
+            f"probability of {100 * stated['level']:.3g} %. {meaning}"
         )
         yield {
             "name": f"Conformity of the largest {quantity} error {where}",

@@ -58,7 +58,7 @@ def load_targets(path: str | Path, robot: Mechanism) -> tuple[FloatArray, tuple[
     for name in table.names:
         if name not in known and not name.startswith(NOTE):
             sentence = f"column {name!r} is unknown{suggest_names(name, known)}"
-            act = f"allowed: {', '.join(known)}; call it '{NOTE} {name}' to ignore it"
+            act = f"allowed: {', '.join(known)}. Call it '{NOTE} {name}' to ignore it"
             raise table.header_error(f"{sentence}; {act}")
     columns = [table.numbers(name, get_dimension(name), empty=False) for name in robot.controlled]
     labels = table.pose_names()
@@ -66,7 +66,7 @@ def load_targets(path: str | Path, robot: Mechanism) -> tuple[FloatArray, tuple[
     for i, label in enumerate(labels):
         if not label or label in used:
             problem = f"duplicate target {label!r}" if label else "this target has no name"
-            raise table.row_error(i, f"{problem}; give each target a name of its own")
+            raise table.row_error(i, f"{problem}. Give each target a separate name")
         used.add(label)
     return np.column_stack(columns), labels
 

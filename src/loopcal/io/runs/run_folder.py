@@ -73,7 +73,7 @@ FAILED_VERDICT, CONVERGED = "not_calibrated", "converged"
 """Verdict of a calibration that failed, and status of a fit that converged, in result.json."""
 
 WARNING = f"""\
-{NOT_CALIBRATED}: the calibration that made this file failed; see result.json beside it.
+{NOT_CALIBRATED}: the calibration that made this file failed. See result.json in its folder.
 """
 
 
@@ -244,7 +244,7 @@ class Run(Result):
             raise FileError(sentence, self.path)
         for file in files.values():
             if sha256(file["path"]) != file["sha256"]:
-                sentence = f"this file was changed since the run in {self.path}; restore it"
+                sentence = f"this file was changed since the run in {self.path}. Restore it"
                 raise FileError(sentence, file["path"])
         data = load_measurements([f["path"] for f in files.values()], self.robot, **allowed)
         fitted = [label not in (*self.held_out, *self.excluded) for label in data.labels]
@@ -360,7 +360,7 @@ def read_run_folder(path: str | Path) -> tuple[dict[str, Any], dict[str, np.ndar
     names = (ARRAYS, _find_robot_file(path).name)
     if missing := [name for name in names if not (path / name).is_file()]:
         sentence = f"this run folder is damaged: {' and '.join(missing)} missing"
-        raise FileError(f"{sentence}; restore it, or repeat the calibration", path)
+        raise FileError(f"{sentence}. Restore it, or repeat the calibration", path)
     result = read_result(path / RESULT)
     digest = result["files"].get(ARRAYS, "none") if "files" in result else None
     arrays = read_run_arrays(path / ARRAYS, digest)

@@ -150,10 +150,10 @@ def read_result(path: Path) -> dict[str, Any]:
     number = content.get("format")
     if isinstance(number, int) and number > FORMAT:
         sentence = f"this run has format {number}, but this loopcal reads formats up to {FORMAT}"
-        raise FileError(f"{sentence}; use a newer loopcal, or repeat the calibration", path)
+        raise FileError(f"{sentence}. Use a newer loopcal, or repeat the calibration", path)
     for key in NEEDED if number == FORMAT else ():
         if key not in content or (key in NEVER_NULL and content[key] is None):
-            raise report_damage(path, f"it states no {key!r}")
+            raise report_damage(path, f"it has no {key!r}")
     text, plain = json.dumps(content, ensure_ascii=False), content
     if _SURROGATE.search(text):
         plain = json.loads(_SURROGATE.sub("?", text))
@@ -220,7 +220,7 @@ def _find_contradiction(budget: Any) -> str | None:
         numbers += table.values()
     for number in numbers:
         if number is not None and not 0.0 <= number < LARGEST:
-            return f"'expected_error' states {number:g}, which is no size of an error"
+            return f"'expected_error' is {number:g}, which is not a size of an error"
     return None
 
 
@@ -278,7 +278,7 @@ def _count_members(stream: BinaryIO) -> int:
     stream.seek(length - END.size)
     signature, *counts = END.unpack(stream.read(END.size))
     if signature != b"PK\5\6":
-        raise ValueError("it is no archive, or its end is missing")
+        raise ValueError("it is not an archive, or its end is missing")
     stream.seek(0)
     return int(counts[3])
 
@@ -296,7 +296,7 @@ def _read_member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarra
         if kind.kind not in KINDS or kind.itemsize == 0:
             raise ValueError(f"{name!r} contains neither numbers nor text")
         if math.prod(shape) * kind.itemsize != member.file_size - stream.tell():
-            raise ValueError(f"{name!r} has another size than its header states")
+            raise ValueError(f"{name!r} has another size than its header")
         values = np.frombuffer(stream.read(), kind)
     return values.reshape(shape, order="F" if is_fortran else "C")
 

@@ -55,5 +55,7 @@ def register_kind(kind: type[K]) -> type[K]:
     from loopcal.measure.kinds.kind import Kind
 
     if not (isinstance(kind, type) and issubclass(kind, Kind) and is_dataclass(kind)):
-        raise DataError(f"{kind!r} is no kind of measurement: it is no dataclass that extends Kind")
+        raise DataError(
+            f"{kind!r} is not a kind of measurement: it is not a dataclass that extends Kind"
+        )
     return KINDS.register(kind)

@@ -205,7 +205,7 @@ class Direction(AxisKind):
 
     def find_invalid_rows(self, measured: FloatArray) -> InvalidRows:
         """Return rows with an incomplete direction, or one whose length is not 1."""
-        incomplete = "has an incomplete direction; give i, j and k, or none of them"
+        incomplete = "has an incomplete direction. Give i, j and k, or none of them"
         invalid = list_rows(is_incomplete(measured), lambda _: incomplete)
         return invalid + list_not_unit(measured, "direction")
 
@@ -313,7 +313,7 @@ class Inclination(DirectionKind):
             is_beyond_vertical | (np.sum(np.sin(measured) ** 2, axis=-1) > 1.0),
             lambda i: (
                 "has tilts of {:.6g} and {:.6g} deg, which are impossible together: elevations of "
-                "two perpendicular axes add up to at most 90 deg; check the unit"
+                "two perpendicular axes add up to at most 90 deg. Check the unit"
             ).format(*np.rad2deg(measured[i])),
         )
 
@@ -374,6 +374,6 @@ class Autocollimation(AxisKind):
             np.asarray(np.any(away, axis=-1)),
             lambda i: (
                 f"has an angle of {np.rad2deg(measured[i][away[i]][0]):.6g} deg, at which the "
-                "mirror faces away from the instrument; check the unit"
+                "mirror faces away from the instrument. Check the unit"
             ),
         )

@@ -140,7 +140,7 @@ class Distance(LengthKind):
             if not self.anchor.any() or abs(stated) <= FLATNESS * s[0]:
                 raise DataError(
                     f"all distances to {self.anchor_name!r} were measured from points in one "
-                    "plane, so it can be on either side of that plane; state an approximate "
+                    "plane, so it can be on either side of that plane. Give an approximate "
                     "'anchor', or measure poses off the plane"
                 )
             side = (centers - middle) @ axes[2] * stated >= 0.0

@@ -61,7 +61,7 @@ class JointSensor(Kind):
         super().__post_init__()
         set_fields(self, joints=check_names(self.joints, "joints"))
         if self.measures not in ("length", "angle"):
-            raise DataError(f"the joints measure {self.measures!r}; use length or angle")
+            raise DataError(f"the joints measure {self.measures!r}. Use length or angle")
 
     @classmethod
     def examples(cls) -> tuple[Self, ...]:

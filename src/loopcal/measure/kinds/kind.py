@@ -239,7 +239,7 @@ class Kind(ABC):
         allowed = tuple(dict.fromkeys((*self.allowed_unknown, self.bias_item, DRIFT, *SCALES)))
         for name in (name for name in names if name not in allowed):
             sentence = f"{name!r} cannot be unknown in the kind {self.name!r}"
-            raise DataError(f"{sentence}; allowed are {', '.join(allowed)}")
+            raise DataError(f"{sentence}. Allowed: {', '.join(allowed)}")
         set_fields(self, unknown=names)
         for setting in fields(self):
             value, how = getattr(self, setting.name), setting.metadata
@@ -247,19 +247,19 @@ class Kind(ABC):
                 set_fields(self, **{setting.name: how["check"](value, how["what"])})
         if self.of and self.poses_per_row > 1:
             raise DataError(
-                f"the kind {self.name!r} compares poses of the end platform; leave out "
+                f"the kind {self.name!r} compares poses of the end platform. Leave out "
                 f"`of: {self.of}`"
             )
         if self.is_of_base and not self.measures_points:
             raise DataError(
                 f"the kind {self.name!r} measures a moving body, but `of: {BASE}` is for targets "
-                "that are fixed to the base; leave it out, or use the kind position, bearing or "
+                "that are fixed to the base. Leave it out, or use the kind position, bearing or "
                 "distance"
             )
         scales = [name for name in names if name in SCALES]
         if scales and not self._length_places[0]:
             raise DataError(
-                f"the kind {self.name!r} measures angles, which have no {scales[0]}; remove "
+                f"the kind {self.name!r} measures angles, which have no {scales[0]}. Remove "
                 f"{scales[0]!r}"
             )
 
@@ -315,7 +315,7 @@ class Kind(ABC):
         """
         for name in (name for name in self.sensed_joints if name not in joints):
             sentence = f"the kind {self.name!r} needs the values of joint {name!r}"
-            raise DataError(f"{sentence}; pass them as `joints`")
+            raise DataError(f"{sentence}. Pass them as `joints`")
         columns = [joints[name][..., rows] for name in self.sensed_joints]
         return np.stack(columns, axis=-1) if columns else None
 
@@ -584,7 +584,7 @@ class Kind(ABC):
             return np.broadcast_to(np.eye(4), T.shape)
         if joints.shape[-1] != 12:
             raise DataError(
-                f"the platform of stage {self.of!r} is not given; pass its numbers as `joints`"
+                f"the platform of stage {self.of!r} is not given. Pass its numbers as `joints`"
             )
         rows = joints.reshape(*joints.shape[:-1], 3, 4)
         last = np.broadcast_to(np.eye(4)[3:], (*rows.shape[:-2], 1, 4))

@@ -121,8 +121,8 @@ class ToolKind(Kind):
         """The stated tool (4, 4); DataError where the kind has none."""
         if self.T_platform_tool is None:
             raise DataError(
-                f"the kind {self.name!r} has no tool: use kind.with_tool(robot.tool), or state "
-                "T_platform_tool (np.eye(4) for the platform itself)"
+                f"the kind {self.name!r} has no tool: use kind.with_tool(robot.tool), or "
+                f"give T_platform_tool (np.eye(4) for the platform itself)"
             )
         return self.T_platform_tool
 
@@ -204,7 +204,7 @@ class Pose(ToolKind):
         """Return rows with an incomplete orientation or a quaternion whose length is not 1."""
         orientation = measured[..., :-3]
         incomplete = (
-            "has an incomplete orientation; give all of its columns or none, or use the kind "
+            "has an incomplete orientation. Give all of its columns or none, or use the kind "
             "'component'"
         )
         invalid = list_rows(is_incomplete(orientation), lambda _: incomplete)
@@ -354,14 +354,13 @@ class Component(ToolKind):
             if name not in self._coordinates:
                 hint = "; declare an orientation to measure angles" if form is None else ""
                 raise DataError(
-                    f"the component {name!r} does not exist; use {', '.join(self._coordinates)}"
+                    f"the component {name!r} does not exist. Use {', '.join(self._coordinates)}"
                     f"{hint}"
                 )
         check_names(self.components, "components")
         if "phi" in self.components and "theta" not in self.components:
             raise DataError(
-                "phi is measured without theta, but phi is not defined where theta is zero; "
-                "measure both or neither"
+                "phi needs theta, because phi is undefined at theta = 0. Measure both or neither"
             )
 
     @cached_property

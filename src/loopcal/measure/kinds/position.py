@@ -67,10 +67,8 @@ class TargetKind(Kind):
         the kinds position, bearing and distance): the targets are fixed to the base. Their rows
         belong to no pose, and unknown ones keep their places in all sessions.
 
-    Raises
-    ------
-    DataError : shapes do not fit, a name occurs twice, `unknown` lists something that is not
-        allowed, or places of targets on the base are neither stated nor unknown.
+    Raises ------ DataError : shapes do not fit, a name occurs twice, `unknown` lists something that
+    is not allowed, or places of targets on the base are neither given nor unknown.
     """
 
     targets: tuple[str, ...] = ("target",)
@@ -94,13 +92,13 @@ class TargetKind(Kind):
             if len(places) != len(targets):
                 raise DataError(
                     f"the number of places is {len(places)}, but there are {len(targets)} targets "
-                    f"({', '.join(targets)}); state one place [x, y, z] for each target"
+                    f"({', '.join(targets)}). Give one place [x, y, z] for each target"
                 )
             set_fields(self, places=check_array(places, "the places of the targets", shape))
         elif self.is_of_base and "targets" not in self.unknown:
             raise DataError(
-                f"the places of {', '.join(targets)} on the base are neither stated nor unknown; "
-                "state `places` in the base frame, or list targets in `unknown`"
+                f"the places of {', '.join(targets)} on the base are neither stated nor unknown. "
+                "Give `places` in the base frame, or list targets in `unknown`"
             )
         elif self.is_of_base:
             set_fields(self, places=np.zeros(shape))
@@ -204,7 +202,7 @@ class TargetKind(Kind):
         if self.places is None:
             raise DataError(
                 f"the kind {self.name!r} has no places of its targets: use "
-                "kind.with_tool(robot.tool), or state `places`"
+                f"kind.with_tool(robot.tool), or give `places`"
             )
         return self.places
 
@@ -297,8 +295,8 @@ class Position(TargetKind):
         if "frame" in self.unknown and extent[1] <= FLATNESS * extent[0]:
             raise DataError(
                 f"the {len(positions)} positions are collinear, so the rotation of the frame "
-                f"{self.frame!r} about their line is not determined; measure poses off the line, "
-                "or state T_base_frame as known"
+                f"{self.frame!r} about their line is not determined. Measure poses off the "
+                f"line, or give a known T_base_frame"
             )
         if "targets" not in self.unknown:
             return setup.encode_frame(self.T_base_frame, align_point_sets(positions, points))[None]
@@ -347,7 +345,7 @@ class Bearing(TargetKind):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.form not in ("theodolite", "camera"):
-            raise DataError(f"the form of a bearing is {self.form!r}; use theodolite or camera")
+            raise DataError(f"the form of a bearing is {self.form!r}. Use theodolite or camera")
 
     @classmethod
     def examples(cls) -> tuple[Self, ...]:

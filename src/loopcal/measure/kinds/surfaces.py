@@ -232,7 +232,7 @@ class Sphere(SurfaceKind):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not self.radius > 0.0:
-            raise DataError(f"the radius of a sphere is {self.radius} m; give a length above 0")
+            raise DataError(f"the radius of a sphere is {self.radius} m. Give a length above 0")
 
     @classmethod
     def examples(cls) -> tuple[Self, ...]:

@@ -506,7 +506,7 @@ def list_conditions(stated: Mapping[str, Condition]) -> Iterator[Actuator]:
         dimension = get_condition_dimension(name)
         if dimension.value != name.partition(".")[0]:
             raise RecordError(
-                f"the condition {name!r} is no column of times, temperatures or loads; call it "
+                f"the condition {name!r} is not a column of times, temperatures or loads. Call it "
                 f"temperature, temperature.PLACE, time, or one of {', '.join(FORCES)}",
                 "conditions",
                 name,
@@ -554,7 +554,7 @@ def couple_joints(
         if name and name not in conditions:
             raise CouplingError(
                 f"coupling {key!r} names the condition {name!r}, which the file does not state"
-                f"{suggest_names(name, list(conditions))}; add it to `conditions:`",
+                f"{suggest_names(name, list(conditions))}. Add it to `conditions:`",
                 key,
             )
         reference = conditions[name].reference if name else 0.0
@@ -562,7 +562,7 @@ def couple_joints(
     for name in conditions:
         if all(coupling.condition != name for coupling in stated.values()):
             raise RecordError(
-                f"the condition {name!r} is in no coupling; name it there, or leave it out",
+                f"the condition {name!r} is in no coupling. Name it there, or leave it out",
                 "conditions",
                 name,
             )
@@ -595,36 +595,36 @@ def _place_coupling(
     for alias in coupling.sum:
         if alias in radius:
             raise CouplingError(
-                f"coupling {key!r} has {alias!r} under both `sum:` and `radius:`; list it once", key
+                f"coupling {key!r} has {alias!r} under both `sum:` and `radius:`. List it once", key
             )
     for alias, weight in weights.items():
         if alias not in known:
             raise CouplingError(
-                f"coupling {key!r} names {alias!r}, which is no drive and no joint of a limb"
-                f"{suggest_names(alias, list(known))}; write limb.joint or the name of a drive",
+                f"coupling {key!r} names {alias!r}, which is neither a drive nor a joint of a limb"
+                f"{suggest_names(alias, list(known))}. Write limb.joint or the name of a drive",
                 key,
             )
         is_angle = coupling.of == "angle" or alias not in coupling.sum
         if turning[known[alias][0]] != is_angle:
             raise CouplingError(
                 f"coupling {key!r} adds {'angles' if is_angle else 'lengths'}, but {alias!r} "
-                + ("slides; state `of: length`" if is_angle else "turns; list it under `radius:`"),
+                + ("slides. Give `of: length`" if is_angle else "turns. List it under `radius:`"),
                 key,
             )
         if not np.isfinite(weight):
             raise CouplingError(
-                f"the weight of {alias!r} in coupling {key!r} is {weight:g}; state a finite number",
+                f"the weight of {alias!r} in coupling {key!r} is {weight:g}. Give a finite number",
                 key,
             )
     if not any(weights.values()):
         raise CouplingError(
-            f"coupling {key!r} has no weight other than 0, so it couples nothing; state one", key
+            f"coupling {key!r} has no weight other than 0, so it couples nothing. Give one", key
         )
     counts = {len(known[alias]) for alias in weights} - {1}
     if len(counts) > 1:
         raise CouplingError(
             f"coupling {key!r} names joints of limbs with {' and '.join(map(str, sorted(counts)))} "
-            "copies; name single copies",
+            "copies. Name single copies",
             key,
         )
     count = counts.pop() if counts else 0
@@ -655,7 +655,7 @@ def coupling_errors(placed: PlacedCoupling) -> ErrorModel:
     for stated in coupling.unknown:
         chosen = [term for term in terms if stated in (term, term.partition(".")[0])]
         if not chosen:
-            hint = f"{suggest_names(stated, list(terms))}; allowed are {', '.join(terms)}"
+            hint = f"{suggest_names(stated, list(terms))}. Allowed: {', '.join(terms)}"
             raise CouplingError(f"coupling {name!r} has no term {stated!r}{hint}", name)
         for term in chosen:
             dimension, nominal, tolerance, axis = terms[term]
@@ -759,7 +759,7 @@ def refuse_idle_drives(
     for name in stated:
         if name not in known:
             raise DriveError(
-                f"actuator {name!r} drives no joint{suggest_names(name, sorted(known))}; write "
+                f"actuator {name!r} drives no joint{suggest_names(name, sorted(known))}. Write "
                 f"'actuated: {name}' at one, or leave it out"
                 + (f"; joints are driven by {', '.join(used)}" if used else ""),
                 name,
@@ -773,12 +773,12 @@ def _check_terms(placed: PlacedDrive) -> PlacedDrive:
     for term in HARMONICS:
         if term in stated and not drive.period:
             raise DriveError(
-                f"actuator {name!r} states {term}, but no period; state the reading's period", name
+                f"actuator {name!r} states {term}, but no period. Give the reading's period", name
             )
     if "curve" in stated and not np.isfinite(placed.list_terms()["curve"][-1]):
         raise DriveError(
             f"actuator {name!r} states a curve, the deviation at the far end of its stroke, but no "
-            "stroke; state the stroke",
+            "stroke. Give the stroke",
             name,
         )
     if drive.compliance < 0.0:
@@ -799,7 +799,7 @@ def _check_table(placed: PlacedDrive) -> None:
     name, points = placed.own.name, np.array([reading for reading, _ in placed.drive.table])
     if not 2 <= len(points) <= MOST_POINTS or not (np.diff(points) > 0.0).all():
         raise DriveError(
-            f"the table of actuator {name!r} has {len(points)} points; state 2 to {MOST_POINTS} "
+            f"the table of actuator {name!r} has {len(points)} points. Give 2 to {MOST_POINTS} "
             "rows [reading, value], the readings growing",
             name,
         )
@@ -810,8 +810,8 @@ def _check_table(placed: PlacedDrive) -> None:
     steps = np.diff(values[0, :, 0])
     if not ((steps > 0.0).all() or (steps < 0.0).all()):
         raise DriveError(
-            f"the table of actuator {name!r} turns its joint back, so that two readings have one "
-            "joint value; correct a value, or state the gain",
+            f"the table of actuator {name!r} turns its joint back, so two readings have one "
+            "joint value. Correct a value, or give the gain",
             name,
         )
 
@@ -836,7 +836,7 @@ def drive_errors(placed: PlacedDrive) -> ErrorModel:
 
 def _refuse_term(name: str, term: str, allowed: tuple[str, ...]) -> DriveError:
     """Return the error of a drive that has no such term."""
-    hint = f"{suggest_names(term, allowed)}; allowed are {', '.join(allowed)}"
+    hint = f"{suggest_names(term, allowed)}. Allowed: {', '.join(allowed)}"
     return DriveError(f"actuator {name!r} has no term {term!r}{hint}", name)
 
 
@@ -862,7 +862,7 @@ def check_motion(name: str, drive: Drive, turns: bool) -> None:
         if turns
         else ("slides", "reads: length, or reads: angle with a radius")
     )
-    raise DriveError(f"actuator {name!r} drives a joint that {motion}; state {allowed}", name)
+    raise DriveError(f"actuator {name!r} drives a joint that {motion}. Give {allowed}", name)
 
 
 def complete_drives(
@@ -909,14 +909,14 @@ def place_triangle(
     if not high**2 - low**2 > 4 * ON_AXIS * float((points**2).sum(axis=1).max()):
         raise DriveError(
             f"the triangle of actuator {name!r} is degenerate: an anchor is on the axis of the "
-            "joint, so that the length is the same at every angle; state anchors beside the axis",
+            "joint, so the length is the same at every angle. Give anchors away from the axis",
             name,
         )
     sine, middle = find_side(start, terms)
     if abs(sine) < DEAD:
         raise DriveError(
             f"actuator {name!r} does not turn its joint at {np.rad2deg(start):g} deg, a dead point "
-            "of its triangle, where both anchors and the axis are in one plane; state another "
+            "of its triangle, where both anchors and the axis are in one plane. Give another "
             "`start:` of the joint, or other anchors",
             name,
         )
@@ -946,7 +946,7 @@ def triangle_errors(
         if is_skew and np.linalg.norm(components[:2]) < ON_AXIS:
             raise DriveError(
                 f"{parameter} rotates the triangle about the joint's own axis, which changes no "
-                "length; leave it out",
+                "length. Leave it out",
                 name,
             )
         stated = getattr(drive.triangle, part)
@@ -1023,7 +1023,8 @@ def list_readings(
         weights: Mapping[str, float] | None = getattr(drive, "sum", None)
         if weights is None:
             raise DriveError(
-                f"actuator {key!r} is a triangle drive beside sums; let it drive a stage of its "
+                f"actuator {key!r} is a triangle drive together with sums. Let it drive a "
+                f"stage of its "
                 "own in a file of the family stages",
                 key,
             )
@@ -1033,7 +1034,7 @@ def list_readings(
         own = [name for name, stated in joints.items() if key in (name, stated)]
         if not own:
             raise DriveError(
-                f"actuator {key!r} drives no joint and states no `sum:`; write 'actuated: {key}' "
+                f"actuator {key!r} drives no joint and has no `sum:`. Write 'actuated: {key}' "
                 f"at a joint, or the sum that it reads of {', '.join(joints)}",
                 key,
             )
@@ -1050,7 +1051,7 @@ def check_rows(sums: Mapping[str, Mapping[str, float]], known: Mapping[str, str]
     if unread:
         raise DriveError(
             f"joint {unread[0]!r} of limb {known[unread[0]]!r} is in no sum, so no reading states "
-            f"it; add it to a `sum:`, or list {unread[0]!r} among the actuators",
+            f"it. Add it to a `sum:`, or list {unread[0]!r} among the actuators",
             next(iter(sums)),
         )
     W = np.array([[weights.get(joint, 0.0) for joint in known] for weights in sums.values()])
@@ -1058,7 +1059,7 @@ def check_rows(sums: Mapping[str, Mapping[str, float]], known: Mapping[str, str]
     if a > joints:
         raise DriveError(
             f"{a} readings ({', '.join(sums)}) are sums of {joints} joints "
-            f"({', '.join(known)}); leave out readings",
+            f"({', '.join(known)}). Leave out readings",
             list(sums)[-1],
         )
     for i in range(a):
@@ -1066,7 +1067,7 @@ def check_rows(sums: Mapping[str, Mapping[str, float]], known: Mapping[str, str]
             name = list(sums)[i]
             raise DriveError(
                 f"the weights of the sums are singular: that of actuator {name!r} follows from "
-                f"those of {', '.join(list(sums)[:i])}, so it states nothing new; correct a weight",
+                f"those of {', '.join(list(sums)[:i])}, so it states nothing new. Correct a weight",
                 name,
             )
 
@@ -1077,20 +1078,20 @@ def _check_sum(name: str, weights: Mapping[str, float], turning: Mapping[str, bo
         if joint not in turning:
             raise DriveError(
                 f"the sum of actuator {name!r} names {joint!r}, which no limb states under "
-                f"'actuated:'{suggest_names(joint, list(turning))}; allowed are "
+                f"'actuated:'{suggest_names(joint, list(turning))}. Allowed: "
                 f"{', '.join(turning)}",
                 name,
             )
         if not np.isfinite(weight):
             raise DriveError(
-                f"the weight of {joint!r} in the sum of actuator {name!r} is {weight:g}; state a "
+                f"the weight of {joint!r} in the sum of actuator {name!r} is {weight:g}. Give a "
                 "finite number",
                 name,
             )
     if not any(weights.values()):
         raise DriveError(
-            f"all weights in the sum of actuator {name!r} are zero, so its reading states nothing; "
-            "give a weight other than 0",
+            f"all weights in the sum of actuator {name!r} are zero, so its reading states nothing. "
+            "Give a weight other than 0",
             name,
         )
     angles = [joint for joint in weights if turning[joint]]
@@ -1125,7 +1126,7 @@ def weight_errors(
         if joint not in weights:
             allowed = (*other, WEIGHT, *(f"{WEIGHT}.{known}" for known in weights))
             raise DriveError(
-                f"actuator {name!r} has no term {WEIGHT + '.' + joint!r}; allowed are "
+                f"actuator {name!r} has no term {WEIGHT + '.' + joint!r}. Allowed: "
                 f"{', '.join(allowed)}",
                 name,
             )

@@ -74,7 +74,7 @@ class Screw:
         if len(self.base_axes) != 6 or len(self.platform_axes) != 6:
             raise MechanismError(
                 f"the screw names {len(self.base_axes)} base_axes and {len(self.platform_axes)} "
-                "platform_axes; name six of each"
+                "platform_axes. Name six of each"
             )
         leads = values_per_leg(self.lead, 6, "the screw's lead")
         return tuple(
@@ -111,7 +111,7 @@ def build_screw_leg(
     for axis in (lower, upper):
         if np.linalg.norm(np.cross(axis, s)) < 1e-6:
             raise MechanismError(
-                f"a screw's joint axis lies along {name} at home; give it another direction"
+                f"a screw's joint axis lies along {name} at home. Give it another direction"
             )
     low, high = _across(s, lower), _across(s, upper)
     turned = float(np.arctan2(np.cross(low, high) @ s, low @ high))
@@ -138,7 +138,7 @@ def _find_direction(
     gap = home[:3, :3] @ np.array(top, dtype=float) + home[:3, 3] - np.array(base, dtype=float)
     length = float(np.linalg.norm(gap))
     if not length > 0:
-        raise MechanismError(f"{name} has length zero at home; move its centers or the home pose")
+        raise MechanismError(f"{name} has length zero at home. Move its centers or the home pose")
     return gap / length, length
 
 
@@ -154,7 +154,7 @@ def _normalize(name: str, axis: Direction) -> FloatArray:
     """Return a unit vector (3,); raises MechanismError for zero."""
     length = float(np.linalg.norm(axis))
     if not length > 0:
-        raise MechanismError(f"a joint axis of {name} is [0, 0, 0]; state a direction")
+        raise MechanismError(f"a joint axis of {name} is [0, 0, 0]. Give a direction")
     return np.array(axis) / length
 
 
@@ -256,13 +256,13 @@ class Gough(RobotRecord):
         check_spherical(self.name, self.spherical, model)
         if self.legs == "ups" and self.cones != GoughCones():
             raise MechanismError(
-                f"{self.name} states cones with legs: ups, whose joints have no cones; state legs: "
+                f"{self.name} states cones with legs: ups, whose joints have no cones. Give legs: "
                 "rod"
             )
         if self.legs == "rod" and asked:
             raise MechanismError(
                 f"{self.name} states legs: rod with {asked[0]}, but a rod has no joints that could "
-                "carry it; state legs: ups"
+                "carry it. Give legs: ups"
             )
 
     def _leg(self, i: int, length: float) -> PlacedLimb:

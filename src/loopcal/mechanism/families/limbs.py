@@ -82,13 +82,13 @@ class Limbs(LimbsFile, RobotRecord):
         """Return all copies of all limbs; raises MechanismError for an inconsistent file."""
         if not self.limbs:
             raise MechanismError(
-                f"{self.name} has no limbs; write those that join the base to the platform"
+                f"{self.name} has no limbs. Write those that join the base to the platform"
             )
         counts = [1 if limb.copies is None else limb.copies.count for limb in self.limbs]
         for limb, count in zip(self.limbs, counts, strict=True):
             if not 1 <= count <= MOST_COPIES:
                 raise MechanismError(
-                    f"limb {limb.name!r} has {count} copies; give 1 to {MOST_COPIES}"
+                    f"limb {limb.name!r} has {count} copies. Give 1 to {MOST_COPIES}"
                 )
         refuse_more(MOST_LIMBS, sum(counts), f"{self.name} has", "limbs")
         named = {body.name: body for body in self.bodies}
@@ -119,8 +119,9 @@ def _copies(
         copies = bodies[end].copies
         if copies is not None and copies.count != count:
             raise MechanismError(
-                f"limb {limb.name!r} has {count} copies, and body {end!r} has {copies.count}; give "
-                f"both the same `copies:`, or name one copy, such as {end + '1'!r}"
+                f"limb {limb.name!r} has {count} copies, and body {end!r} has "
+                f"{copies.count}. Give both equal `copies:`, or name one copy, such as "
+                f"{end + '1'!r}"
             )
     turns = _list_turns(limb.copies)
     for number, turn in enumerate(turns, 1):
@@ -156,7 +157,7 @@ def _place_bodies(record: Limbs, limbs: Sequence[Limb]) -> dict[str, FloatArray]
     missing = [name for name in names if name not in known]
     if missing:
         raise MechanismError(
-            f"body {missing[0]!r} has no rigid limb from a body with a known pose; state its "
+            f"body {missing[0]!r} has no rigid limb from a body with a known pose. Give its "
             "`home:` under `bodies:`"
         )
     return {name: known[name] for name in names}
@@ -182,23 +183,23 @@ def _check_ends(limbs: Sequence[Limb], names: Sequence[str]) -> None:
     for name in names:
         if name in (BASE, PLATFORM) or names.count(name) > 1:
             raise MechanismError(
-                f"two bodies are called {name!r}, base and platform among them; rename one"
+                f"two bodies are called {name!r}, base and platform among them. Rename one"
             )
         if name not in joined:
             raise MechanismError(
-                f"no limb joins the body {name!r}; let limbs begin or end on it, or leave it out"
+                f"no limb joins the body {name!r}. Let limbs begin or end on it, or leave it out"
             )
     for limb in limbs:
         for name in (limb.on, limb.to):
             if name not in (BASE, PLATFORM, *names):
                 raise MechanismError(
                     f"limb {limb.name!r} names {name!r}, which is not a body"
-                    f"{suggest_names(name, names)}; add it to `bodies:`, or name one of "
+                    f"{suggest_names(name, names)}. Add it to `bodies:`, or name one of "
                     f"{', '.join((BASE, PLATFORM, *names))}"
                 )
         if limb.on == limb.to:
             raise MechanismError(
-                f"limb {limb.name!r} begins and ends on {limb.on!r}, which it cannot move; name "
+                f"limb {limb.name!r} begins and ends on {limb.on!r}, which it cannot move. Name "
                 "two bodies under `on:` and `to:`"
             )
 
@@ -220,8 +221,8 @@ def _place_copy(
     """
     if limb.ending != "distance" and (limb.length or limb.actuated or limb.cones):
         raise MechanismError(
-            f"limb {limb.name!r} ends {limb.ending} and states a length, drive or cone of a rod; "
-            "state ending: distance, or leave it out"
+            f"limb {limb.name!r} ends {limb.ending} and states a length, drive or cone of a rod. "
+            "Give ending: distance, or leave it out"
         )
     if limb.ending == "distance" and not limb.actuated and not limb.length > 0:
         raise MechanismError(
@@ -250,8 +251,8 @@ def _place_copy(
     for step in steps:
         if step.joint.name == limb.to:
             raise MechanismError(
-                f"limb {limb.name!r} has a joint {limb.to!r}, like the body on which it ends; "
-                "rename the joint"
+                f"limb {limb.name!r} has a joint {limb.to!r}, like the body on which it ends. "
+                "Rename the joint"
             )
     placed = place_limb(
         limb.name + suffix,
@@ -296,7 +297,7 @@ def _shifts(limb: PlacedLimb, entry: Shifts) -> ErrorModel:
         if axis == "length":
             if limb.limb.ending != "distance" or entry.of != "rod":
                 raise MechanismError(
-                    f"{limb.name!r}: 'length' belongs to a rod; write 'of: rod' in a limb that "
+                    f"{limb.name!r}: 'length' belongs to a rod. Write 'of: rod' in a limb that "
                     "ends in a distance"
                 )
             name = label if entry.name else f"{limb.name}.length"

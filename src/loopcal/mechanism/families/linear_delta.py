@@ -107,7 +107,7 @@ class LinearDelta(RobotRecord):
         """Return three limbs, a driven carriage and a rod each; the platform keeps x, y and z."""
         arms, stops = values_per_leg(self.arms, 3, "arms"), values_per_leg(self.stops, 3, "stops")
         if len(self.angles) != 3:
-            raise MechanismError(f"{self.name} has {len(self.angles)} tower angles; state three")
+            raise MechanismError(f"{self.name} has {len(self.angles)} tower angles. Give three")
         if not min(arms) > self.radius > 0:
             raise MechanismError(
                 f"{self.name} has a radius of {self.radius * 1e3:g} mm and an arm of "

@@ -103,8 +103,8 @@ def is_always_positive(named: NamedParameter) -> bool:
     nominal = get_quantity(named)[1]
     if is_stated and not nominal > 0.0:
         raise MechanismError(
-            f"parameter {named.name!r} is stated to be positive, but its nominal value is "
-            f"{nominal * 1e3:g} mm; correct the value, or leave out 'positive'"
+            f"parameter {named.name!r} must be positive, but its nominal value is "
+            f"{nominal * 1e3:g} mm. Correct the value, or leave out 'positive'"
         )
     return is_stated or any(entry.axis in POSITIVE for entry in named.maps)
 
@@ -115,7 +115,7 @@ def find_engine_axis(name: str, entry: MapEntry) -> tuple[str, float]:
     """
     if entry.axis == "pitch":
         raise MechanismError(
-            f"parameter {name!r} is mapped onto 'pitch'; use lead, the advance in one turn"
+            f"parameter {name!r} is mapped onto 'pitch'. Use lead, the advance in one turn"
         )
     coefficient = entry.coefficient * (1.0 if entry.arm is None else entry.arm)
     if entry.axis == "lead":
@@ -143,19 +143,19 @@ def check_units(named: NamedParameter, entry: MapEntry, drive: Row | None) -> No
     if entry.arm is not None:
         if dimension is Dimension.LENGTH:
             raise MechanismError(
-                f"{what} with an arm; leave the arm out, which turns an angle into a length"
+                f"{what} with an arm. Leave the arm out, which turns an angle into a length"
             )
         if needed is not Dimension.LENGTH:
-            raise MechanismError(f"{what} with an arm and {onto}; leave the arm out")
+            raise MechanismError(f"{what} with an arm and {onto}. Leave the arm out")
         return
     slope = dimension is Dimension.RATIO and needed is Dimension.ANGLE
     if dimension is needed or slope:
         return
     if needed is Dimension.LENGTH:
         raise MechanismError(
-            f"{what} and {onto}; state an `arm:` [length per radian], or the parameter as a length"
+            f"{what} and {onto}. Give an `arm:` [length per radian], or the parameter as a length"
         )
-    raise MechanismError(f"{what} and {onto}; state it as {ARTICLES[needed]}")
+    raise MechanismError(f"{what} and {onto}. Give it as {ARTICLES[needed]}")
 
 
 def named_error(
@@ -185,7 +185,7 @@ def _map_entry(
     if not chosen:
         known = dict.fromkeys([*(limb.stem for limb in limbs), *sorted(drives)])
         raise MechanismError(
-            f"parameter {name!r} is mapped onto {entry.limb!r}, which is not there; known are "
+            f"parameter {name!r} is mapped onto {entry.limb!r}, which is not there. Known: "
             f"{', '.join(known)}"
         )
     for limb in chosen:

@@ -159,7 +159,7 @@ def frame_from_axis(axis: FloatArray, owner: str) -> FloatArray:
     """
     length = float(np.linalg.norm(axis))
     if not length > 0:
-        raise MechanismError(f"{owner} has the axis [0, 0, 0]; state a direction")
+        raise MechanismError(f"{owner} has the axis [0, 0, 0]. Give a direction")
     z = np.asarray(axis, dtype=float) / length
     # the cyclic successor of the largest component is never parallel to the axis
     across = np.eye(3)[(int(np.argmax(np.abs(z))) + 1) % 3]
@@ -204,8 +204,8 @@ def map_slide_tilt(
     place = names.index(element)
     if place >= len(limb.limb.joints) or limb.limb.joints[place].kind != "P":
         raise MechanismError(
-            f"{parameter} tilts {element!r} of {limb.name!r} alone, which only a slide allows; "
-            "leave out `alone: true`"
+            f"{parameter} tilts {element!r} of {limb.name!r} alone, which only a slide allows. "
+            "Leave out `alone: true`"
         )
     w, after = np.eye(3)[AXES.index(axis)], names[place + 1]
     behind = limb.placements[after]
@@ -459,14 +459,12 @@ def standard_deviation(
     if tolerance is None:
         return None
     if (tolerance.sd is None) == (tolerance.limits is None):
-        raise MechanismError(
-            f"the tolerance of {name} must state either sd or limits, not both or neither"
-        )
+        raise MechanismError(f"the tolerance of {name} must give exactly one of sd and limits")
     stated = tolerance.sd if tolerance.sd is not None else tolerance.limits or 0.0
     if not is_sd(stated):
         unit = {LengthTolerance: " m", AngleTolerance: " rad", RatioTolerance: ""}[type(tolerance)]
         raise MechanismError(
-            f"the tolerance of {name} is {stated:g}{unit}; it must be greater than zero "
+            f"the tolerance of {name} is {stated:g}{unit}, but must be greater than zero "
             f"({SD_RANGE}), or left out"
         )
     return float(stated if tolerance.sd is not None else stated / np.sqrt(3.0))

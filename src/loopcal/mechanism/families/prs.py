@@ -72,7 +72,7 @@ class ChainFrames(NamedTuple):
         if not aside < self.length:
             raise MechanismError(
                 f"the rod of {name} is {self.length * 1e3:g} mm long, but its ball is "
-                f"{aside * 1e3:.6g} mm beside the guide at home; state a longer rod"
+                f"{aside * 1e3:.6g} mm away from the guide at home. Give a longer rod"
             )
         return gap
 

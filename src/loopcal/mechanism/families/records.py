@@ -68,7 +68,7 @@ class CommonErrorRecord:
         stated = {d: t for d in Dimension if (t := getattr(self, d.value, None)) is not None}
         if len(stated) != 1:
             raise MechanismError(
-                f"common error {self.name!r} states {len(stated)} tolerances; give one, such as "
+                f"common error {self.name!r} states {len(stated)} tolerances. Give one, such as "
                 "`length: {sd: 0.1}`"
             )
         ((dimension, tolerance),) = stated.items()
@@ -81,8 +81,8 @@ class CommonErrorRecord:
             self._check(parameter, dimension)
         if len(chosen) < 2:
             raise MechanismError(
-                f"common error {self.name!r} belongs to {chosen[0].name} alone; name two or more "
-                "parameters, or state the tolerance of that parameter"
+                f"common error {self.name!r} belongs to {chosen[0].name} alone. Name two or "
+                f"more parameters, or give the tolerance of that parameter"
             )
         return CommonError(self.name, tuple(parameter.name for parameter in chosen), sd)
 
@@ -92,11 +92,11 @@ class CommonErrorRecord:
         if parameter.dimension is not dimension:
             raise MechanismError(
                 f"{place} states a tolerance of {dimension.value}, but the parameter is of "
-                f"dimension {parameter.dimension.value}; use the key `{parameter.dimension.value}`"
+                f"dimension {parameter.dimension.value}. Use the key `{parameter.dimension.value}`"
             )
         if parameter.tolerance is None:
             raise MechanismError(
-                f"{place}: the parameter has no tolerance of its own; state it, because no two "
+                f"{place}: the parameter has no separate tolerance. Give it, because no two "
                 "parts are exactly equal"
             )
 
@@ -250,7 +250,7 @@ class RobotRecord:
         titles = [error.name for error in common]
         if duplicate := [title for title in titles if titles.count(title) > 1]:
             raise MechanismError(
-                f"two common errors are called {duplicate[0]!r}; give each its own name"
+                f"two common errors are called {duplicate[0]!r}. Give each its own name"
             )
         load = self.load.place(self.conditions)
         is_elastic = any(a.name.startswith(LOAD) for a in expanded.actuators)
@@ -281,7 +281,7 @@ def match_parameter_names(pattern: str, names: Sequence[str], key: str = "fixed"
     if not matching:
         hint = suggest_names(pattern, names) or f"; its parameters are {', '.join(names)}"
         raise MechanismError(
-            f"{pattern!r} under `{key}` matches no parameter of this robot{hint}; correct it"
+            f"{pattern!r} under `{key}` matches no parameter of this robot{hint}. Correct it"
         )
     return matching
 
@@ -291,7 +291,7 @@ def values_per_leg(value: float | tuple[float, ...], count: int, name: str) -> t
     values = (value,) * count if isinstance(value, (int, float)) else tuple(value)
     if len(values) != count:
         raise MechanismError(
-            f"{name} has {len(values)} values for {count} legs; give one value, or one for each leg"
+            f"{name} has {len(values)} values for {count} legs. Give one value, or one for each leg"
         )
     return tuple(float(v) for v in values)
 
@@ -301,5 +301,5 @@ def check_spherical(name: str, spherical: str, error_model: str) -> None:
     if spherical == "axes" and error_model == "ideal":
         raise MechanismError(
             f"{name} states spherical: axes with error_model: ideal, whose parameters describe "
-            "perfect points; state error_model: complete, or spherical: point"
+            "perfect points. Give error_model: complete, or spherical: point"
         )

@@ -80,13 +80,15 @@ def check_stage_names(names: Sequence[str], parents: Sequence[str | None]) -> li
     previous one.
     """
     if not names:
-        raise StageError("there are no stages; list those of the chain, from the base on", 0)
+        raise StageError(
+            ("there are no stages. List the coordinates of the chain, from the base on"), 0
+        )
     for i, name in enumerate(names):
         if name in names[:i]:
-            raise StageError(f"two stages are called {name!r}; give each its own name", i)
+            raise StageError(f"two stages are called {name!r}. Give each its own name", i)
         if name == BASE or "." in name or ":" in name or not name:
             raise StageError(
-                f"a stage cannot be called {name!r}; choose a name without a point or colon, other "
+                f"a stage cannot be called {name!r}. Choose a name without a point or colon, other "
                 f"than {BASE!r}",
                 i,
             )
@@ -96,7 +98,7 @@ def check_stage_names(names: Sequence[str], parents: Sequence[str | None]) -> li
         if on not in (BASE, *names):
             raise StageError(
                 f"stage {names[i]!r} is on {on!r}, which is not a stage"
-                f"{suggest_names(on, names[:i])}; allowed are {', '.join((BASE, *names[:i]))}",
+                f"{suggest_names(on, names[:i])}. Allowed: {', '.join((BASE, *names[:i]))}",
                 i,
             )
     for i, on in enumerate(stated):
@@ -119,7 +121,7 @@ def _refuse_later(names: Sequence[str], parents: Sequence[str], i: int) -> None:
             i,
         )
     raise StageError(
-        f"stage {names[i]!r} is on {parents[i]!r}, which is listed behind it; list "
+        f"stage {names[i]!r} is on {parents[i]!r}, which is listed behind it. List "
         f"{parents[i]!r} first",
         i,
     )
@@ -188,7 +190,7 @@ def _refuse_wrong_drives(stages: Sequence[AttachedStage]) -> None:
     for i, stage in enumerate(stages):
         if not stage.assembly.actuators:
             raise StageError(
-                f"stage {stage.name!r} has no actuators; name the drive of one of its joints, or "
+                f"stage {stage.name!r} has no actuators. Name the drive of one of its joints, or "
                 "make it part of the mount of the next stage",
                 i,
             )
@@ -197,8 +199,8 @@ def _refuse_wrong_drives(stages: Sequence[AttachedStage]) -> None:
         for drive in own:
             if drive in owner:
                 raise StageError(
-                    f"actuator {drive!r} drives the stages {owner[drive]!r} and {stage.name!r}; "
-                    "give each stage its own drives",
+                    f"actuator {drive!r} drives the stages {owner[drive]!r} and {stage.name!r}. "
+                    "Give each stage its own drives",
                     i,
                 )
         owner |= dict.fromkeys(own, stage.name)
@@ -326,20 +328,20 @@ class PlacedStages(Stages):
         """Return the assembly of all stages; raises StageError where they do not fit together."""
         if self.parameters:
             raise RecordError(
-                f"{self.name} states `parameters:` of a whole chain; state them in a stage that "
+                f"{self.name} states `parameters:` of a whole chain. Give them in a stage that "
                 "has a `family:`",
                 "parameters",
             )
         others = [name for name in self.conditions if name not in FORCES]
         if self.couplings or others:
             raise RecordError(
-                f"{self.name} couples joints of different stages; describe these stages as one "
-                "robot of family limbs, and state `couplings:` there",
+                f"{self.name} couples joints of different stages. Describe these stages as "
+                f"one robot of family limbs, with `couplings:`",
                 "couplings" if self.couplings else "conditions",
             )
         if self.home != PoseRecord():
             raise MechanismError(
-                f"{self.name} states `home:`, but the home of a chain is that of its stages; state "
+                f"{self.name} states `home:`, but the home of a chain comes from its stages. Give "
                 "`start:` of a joint or `home:` of a stage"
             )
         names = [stage.name for stage in self.stages]
@@ -372,13 +374,13 @@ class PlacedStages(Stages):
             return expand_joint(stage.name, joint, self.drives)
         if robot is None:
             raise StageError(
-                f"stage {stage.name!r} is neither a joint nor a robot; write 'joint:', or "
+                f"stage {stage.name!r} is neither a joint nor a robot. Write 'joint:', or "
                 "'family:' with the keys of that family",
                 i,
             )
         if robot.tool != PoseRecord():
             raise StageError(
-                f"stage {stage.name!r} states a tool; state it for the whole robot, or as the "
+                f"stage {stage.name!r} states a tool. Give it for the whole robot, or as the "
                 "mount of the next stage",
                 i,
             )
@@ -423,7 +425,7 @@ def expand_joint(
     stated = _select_drives(drives, [drive])
     if triangle is not None and stated:
         raise RecordError(
-            f"the drive {drive!r} is stated twice, at its joint and under `drives:`; leave one out",
+            f"the drive {drive!r} appears twice, at its joint and under `drives:`. Leave one out",
             "drives",
             drive,
         )
@@ -456,7 +458,7 @@ def _refuse_terms_beside_triangle(record: SerialRotation | SerialSlide, drive: s
         if is_stated:
             raise MechanismError(
                 f"the joint states '{key}' beside the triangle of drive {drive!r}, whose readings "
-                "are lengths; state it in the drive"
+                "are lengths. Give it in the drive"
                 + (" under 'unknown'" if key.startswith("errors") else "")
             )
 

@@ -221,7 +221,7 @@ def draw_reached(
     if reached.sum() < n:
         raise DataError(
             f"{robot.name} with errors by its tolerances reaches {int(reached.sum())} of "
-            f"{len(reached)} poses of its workspace; state a smaller workspace or tolerances"
+            f"{len(reached)} poses of its workspace. Give a smaller workspace or tolerances"
         )
     return drawn.coordinates[reached][:n]
 

@@ -98,10 +98,10 @@ RULE = (
     "probability of at least {level:.3g} %, nonconformity where it exceeds the limit with this "
     "probability, and neither otherwise."
 )
-NO_RULE = "No limit was stated, so this document states no conformity."
+NO_RULE = "No limit was stated, so this document has no conformity."
 NO_VOLUME = "No working volume was stated, so the result holds for the measured poses."
 NO_RESULT = (
-    "No pose was held out of the fit and no working volume was stated, so the document states no "
+    "No pose was held out of the fit and no working volume was stated, so the document has no "
     "error of the calibrated machine."
 )
 VALIDITY = (
@@ -315,7 +315,7 @@ HEIGHTS = (
 )
 
 NOT_HELD_OUT = (
-    "No pose was held out of this fit, so the report states no error at poses that were not fitted."
+    "No pose was held out of this fit, so the report has no error at poses that were not fitted."
 )
 NOT_STORED = (
     "This run folder was written by an earlier version, whose errors at held-out poses cannot be "
@@ -395,10 +395,10 @@ TERMS = (
 BUDGET_TERMS = (
     "Evaluation of type A uses the scatter of these data, type B uses stated values such as the "
     "sigma of the instrument and the tolerances. A position or orientation error is the length of "
-    "a vector, so the table states no coverage factor for it. The parameters below have one."
+    "a vector, so the table has no coverage factor for it. The parameters below have one."
 )
 NOT_TRACEABLE = (
-    "The data state no serial number, certificate or date of calibration of the instrument, so "
+    "The data have no serial number, certificate or date of calibration of the instrument, so "
     "this report does not show traceability."
 )
 NO_BUDGET = "This fit has no intervals, so there is no uncertainty budget."
@@ -522,7 +522,7 @@ EVERYWHERE = (
     "move programs, it also writes others that leave them where they are, if there are any."
 )
 NO_CONTROLLER = "No format of a controller that loopcal writes can express this robot."
-FAILED = "The calibration failed, so the report states no values for a controller."
+FAILED = "The calibration failed, so the report has no values for a controller."
 
 
 @describes_section("controller", "Values for the controller")

@@ -98,16 +98,17 @@ def draw_residual_picture(record: CalibrationRecord) -> Iterator[Element]:
     if any(rows.kind == ActuatorReadings.name for rows in residuals):
         shrinkage = (
             "The actuator readings are uncertain, so every pose is estimated too and follows its "
-            "measured values: residuals far below one sigma do not show that sigma is too large. "
-            "Chi-square above allows for that."
+            "measured values. Residuals far below one sigma are therefore normal. Chi-square "
+            "above allows for that."
         )
     setup = [row["name"] for row in record.result["fit"].get("local") or ()]
     yield make_picture(
         draw_residual_rows(record.robot, residuals, setup),
         "residual-figure",
         "Residuals of the fitted rows.",
-        "The panels show the residuals in the order of the poses, by component, as a histogram and "
-        "normal plot, and against actuator readings and recorded quantities. Whitened residuals "
+        "The panels show the residuals in the order of the poses, by component, as "
+        "histogram and normal plot, and against readings and recorded quantities. Whitened "
+        "residuals "
         "are divided by their sigma; of errors with the stated noise 95 % lie between the dashed "
         f"lines. {shrinkage}",
     )
@@ -172,10 +173,10 @@ def draw_scene_picture(record: CalibrationRecord) -> Iterator[Element]:
     """Yield the robot at home with the measured poses and the errors that calibration removes."""
     readings = record.readings
     if not record.converged:
-        yield "The fit did not converge, so there is no calibrated geometry to draw."
+        yield "The fit did not converge, so the calibrated geometry is missing."
         return
     if readings is None or not len(readings):
-        yield "The run does not contain the readings of its poses, so they are not drawn."
+        yield "The run lacks the readings of its poses, so the picture omits them."
         return
     accuracy = compute_accuracy(record)
     accuracy = None if isinstance(accuracy, str) else accuracy
@@ -257,7 +258,7 @@ def compute_accuracy(record: CalibrationRecord) -> AccuracyMap | str:
     """Return the uncertainty of poses over the workspace, or the sentence why it is not known."""
     budget, readings = record.result.get("expected_error"), record.readings
     if record.posterior is None or readings is None or not budget:
-        return "This run has no intervals, so the accuracy over the workspace is not known."
+        return "Without intervals, the accuracy over the workspace is unknown."
     measured, frame = (
         readings[choose_evenly(len(readings), MOST_ROWS)],
         budget.get("frame", "fitted"),

@@ -32,26 +32,23 @@ from loopcal.report.validation_view import build_errors, build_estimates, build_
 HEADS: Mapping[bool | None, str] = {True: "not_calibrated", False: "calibrated", None: "undecided"}
 """Whether a machine has changed -> the color of the head, as of a verdict."""
 SUMMARIES: Mapping[bool | None, str] = {
-    True: "A machine differs from that of {first}, beyond the noise.",
-    False: "The machines do not differ from that of {first} beyond the noise.",
+    True: "A machine differs from {first} by more than the noise.",
+    False: "The machines agree with {first} within the noise.",
     None: "Whether a machine has changed was not tested.",
 }
 MEANING = (
-    "The first run is the reference of all others. A change is tested where the data of two runs "
-    "are independent, in the directions that both data sets determine. If nothing has changed, a "
-    "change is reported in 5 % of cases, for all runs together."
+    "The first run is the reference of all others. For independent data of two runs, a change is "
+    "tested in the directions that both data sets determine. If nothing has changed, a change is "
+    "reported in 5 % of cases, for all runs together."
 )
-NO_SHIFTS = (
-    "The data of the runs are not independent, or have no direction in common, so no shift was "
-    "tested."
-)
+NO_SHIFTS = "The runs share data or have no common direction, so loopcal tested no shift."
 
 
 def build_comparison_document(comparison: RunComparison, made_by: str) -> Document:
     """Return a comparison as a document; made_by : program and version."""
     names = ", ".join(run.name for run in comparison.runs)
     sections: dict[tuple[str, str], Callable[[RunComparison], Iterator[Element]]] = {
-        ("result", "Whether and where the machine changed"): _describe_result,
+        ("result", "Changes of the machine"): _describe_result,
         ("parameters", "Parameters side by side"): _describe_parameters,
         ("shifts", "Shifts in standard deviations"): _describe_shifts,
         ("errors", "Held-out errors"): _describe_errors,
@@ -80,8 +77,8 @@ def _describe_parameters(comparison: RunComparison) -> Iterator[Element]:
         draw_run_parameters(comparison),
         "estimates-figure",
         "Estimates of all runs with their 95 % intervals.",
-        "For each parameter the figure shows the estimate of each run minus that of the first run, "
-        "with its interval, in half-widths of the first run's interval. The table has the numbers.",
+        "For each parameter the figure shows the estimate of each run minus the first run, with "
+        "its interval, in half-widths of the first run's interval. The table has the numbers.",
     )
 
 
@@ -94,9 +91,9 @@ def _describe_shifts(comparison: RunComparison) -> Iterator[Element]:
         draw_run_shifts(comparison),
         "shift-figure",
         "Shift of each parameter from the first run.",
-        "For each parameter the figure shows the shift in standard deviations while all others may "
-        "have changed, too. Filled markers are significant at 5 % for all parameters and runs "
-        "together. A parameter without a marker is not determined by both data sets.",
+        "For each parameter the figure shows the shift in standard deviations while all others "
+        "may have changed, too. Filled markers are significant at 5 % for all parameters and runs "
+        "together. A parameter without a marker is undetermined in one of the data sets.",
     )
     yield build_shifts(comparison)
 

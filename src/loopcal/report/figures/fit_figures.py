@@ -248,7 +248,7 @@ def _draw_histogram(axes: Axes, whitened: FloatArray) -> None:
     edges, x = np.linspace(-reach, reach, bins + 1).tolist(), np.linspace(-reach, reach, 200)
     axes.hist(whitened, edges, density=True, color=COLORS[5], ec="white")
     axes.plot(x, np.exp(-0.5 * x**2) / np.sqrt(2.0 * np.pi), color=DARK, lw=LINE)
-    label_axes(axes, SIGMAS, "density [1/sigma]", "histogram; line: stated noise")
+    label_axes(axes, SIGMAS, "density [1/sigma]", "histogram, line: given noise")
 
 
 def _draw_normal_plot(axes: Axes, whitened: FloatArray) -> None:
@@ -260,7 +260,7 @@ def _draw_normal_plot(axes: Axes, whitened: FloatArray) -> None:
     _plot(axes, x, values, {"marker": "o", "ls": "none", "color": COLORS[0], "ms": DOT - 0.5})
     if len(values):
         axes.plot(x[[0, -1]], x[[0, -1]], color=DARK, lw=LINE)
-    label_axes(axes, "normal quantile [sigma]", SIGMAS, "normal plot; line: stated noise")
+    label_axes(axes, "normal quantile [sigma]", SIGMAS, "normal plot, line: given noise")
 
 
 def _add_band(axes: Axes) -> None:
@@ -587,6 +587,6 @@ def draw_regularization(curves: RegularizationCurves) -> Figure:
     powers = np.arange(np.ceil(ticks[0]), ticks[-1] + 1, step)
     panels[0].set_xticks(10.0**powers, [f"1e{int(power)}" for power in powers])
     panels[0].minorticks_off()
-    panels[0].set_ylabel("held-out mean square over that of noise [1]")
+    panels[0].set_ylabel("held-out mean square over noise [1]")
     scale_logarithmically(panels[0].yaxis)
     return finish_figure(figure, f"{curves.robot}: n = {curves.poses} poses")

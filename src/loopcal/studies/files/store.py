@@ -602,7 +602,7 @@ def _refuse_content(folder: Path) -> None:
     """Raise FileError where a folder contains something, or where its name is that of a file."""
     target = resolve_links(folder)
     if target.exists() and not target.is_dir():
-        sentence = "this is a file, but a study is a folder; choose another name"
+        sentence = "this is a file, but a study is a folder. Choose another name"
         raise FileError(sentence, folder)
     if target.is_dir() and any(target.iterdir()):
         code = "store.in-use" if (target / NAME).is_file() else "store.folder-of-others"

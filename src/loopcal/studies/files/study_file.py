@@ -131,8 +131,8 @@ def _apply_quick_tier(content: StudyContent) -> StudyContent:
         return StudyContent(file, {**content.values, "replicates": block}, content.places)
     if not isinstance(stated, dict):
         raise file.error(
-            "'quick' must state the settings that it replaces; write for example "
-            "'quick: {replicates: 50}'",
+            "'quick' must contain the settings that it replaces. Write for example 'quick: "
+            "{replicates: 50}'",
             (QUICK,),
         )
     allowed = [key for key in SETTINGS if key != "title"]
@@ -155,7 +155,7 @@ def build_study(content: StudyContent) -> Study:
         for name, value, place in _list_items(content, key):
             if not plain and not isinstance(value, dict):
                 raise file.error(
-                    f"the level {name!r} of {key!r} must state its settings; write "
+                    f"the level {name!r} of {key!r} must state its settings. Write "
                     "'name: {setting: value}' lines",
                     place,
                 )
@@ -180,16 +180,14 @@ def _load_pose_files(
         key_place = (*place, "file")
         if "coordinates" in stated:
             key_place = (*place, "coordinates")
-            raise file.error("poses are given by a file; write 'file: poses.csv'", key_place)
+            raise file.error("poses are given by a file. Write 'file: poses.csv'", key_place)
         if "file" not in stated:
             continue
         if len(stated) > 1:
-            raise file.error("a file of poses needs no other setting; remove the others", key_place)
+            raise file.error("a file of poses needs no other setting. Remove the others", key_place)
         path = find_file_beside(file, stated["file"], key_place)
         if path is None:
-            raise file.error(
-                f"there is no file {stated['file']!r} beside the study file", key_place
-            )
+            raise file.error(f"the folder of the study file lacks {stated['file']!r}", key_place)
         try:
             read = [load_poses(path, robot).tolist() for robot in robots]
         except LoopcalError as error:
@@ -205,7 +203,7 @@ def read_robots(content: StudyContent) -> dict[str, tuple[Robot, Mechanism]]:
     """Return name -> robot of the key `robots`: shipped names, or files beside the study file."""
     file = content.file
     if "robots" not in content.values:
-        raise file.error("this study names no robot; add for example 'robots: [hexapod-42]'")
+        raise file.error("this study names no robot. Add for example 'robots: [hexapod-42]'")
     robots = {}
     for name, value, place in _list_items(content, "robots"):
         if not isinstance(value, str):
@@ -229,11 +227,11 @@ def _list_items(content: StudyContent, key: str) -> Iterator[tuple[str, Any, Loc
         places = [(*place, i) for i in range(len(nodes))] if isinstance(node, list) else [place]
         items = [(_name(file, v, p), v, p) for v, p in zip(nodes, places, strict=True)]
     if not items:
-        raise file.error(f"{key!r} has no level; give at least one", place)
+        raise file.error(f"{key!r} has no level. Give at least one", place)
     names = set()
     for name, value, level_place in items:
         if name in names:
-            raise file.error(f"two levels of {key!r} are named {name!r}; remove one", level_place)
+            raise file.error(f"two levels of {key!r} are named {name!r}. Remove one", level_place)
         names.add(name)
         yield name, value, level_place
 
@@ -242,7 +240,7 @@ def _name(file: YamlFile, value: Any, place: Location) -> str:
     """Return the name of a level that is a plain value."""
     if isinstance(value, bool) or not isinstance(value, str | int | float):
         raise file.error(
-            "a level without a name must be a number or a word; write 'name: {setting: value}'",
+            "a level without a name must be a number or a word. Write 'name: {setting: value}'",
             place,
         )
     return Path(value).stem if isinstance(value, str) and "/" in value else str(value)
@@ -279,7 +277,7 @@ def _check_surfaces(level: PosesLevel, study: Study, robots: Sequence[Mechanism]
         for effects in study.effects.values():
             check_effects(effects)
         if study.scores.verdict:
-            raise DataError("points on planes and lines are studied without a verdict; remove it")
+            raise DataError("points on planes and lines are studied without a verdict. Remove it")
 
 
 def _check_method(level: MethodLevel, study: Study, robots: Sequence[Mechanism]) -> None:
@@ -294,12 +292,12 @@ def _check_method(level: MethodLevel, study: Study, robots: Sequence[Mechanism])
             Ridge(level.lam).resolve(select_free_parameters(robot).names)
     if level.is_of_products and not all(poses.is_on_surfaces for poses in study.poses.values()):
         raise DataError(
-            f"'rows: {level.rows}' needs points on planes and lines; write 'choice: plane-line' "
+            f"'rows: {level.rows}' needs points on planes and lines. Write 'choice: plane-line' "
             "for all poses, or remove it"
         )
     if level.is_published and (study.scores.verdict or study.scores.intervals == "adjusted"):
         raise DataError(
-            "methods of published studies have neither a verdict nor intervals; remove 'verdict' "
+            "methods of published studies have neither a verdict nor intervals. Remove 'verdict' "
             "and 'intervals' of the scores"
         )
 
@@ -312,7 +310,7 @@ def _check_errors(level: ErrorsLevel, robots: Sequence[Mechanism]) -> None:
         if level.smallest and robot.parameters.common:
             raise DataError(
                 f"{robot.name} has errors that several parameters have in common, whose sum has no "
-                "smallest size; remove 'smallest'"
+                "smallest size. Remove 'smallest'"
             )
         resolve_patterns(robot.parameters, level.tolerances)
         resolve_patterns(robot.parameters, level.deviations)

@@ -215,8 +215,8 @@ def _count_reached(
 
 NOTE = (
     "Shares of the simulated machines within the limit; failed trials count as outside. The "
-    "intervals of one row hold together with 95 % probability. Levels between those of the study "
-    "were not simulated."
+    "intervals of one row hold together with 95 % probability. The study contains no levels "
+    "between these."
 )
 
 EXTEND = "More machines decide an answer that is not certain (loopcal study extend)."

@@ -160,7 +160,7 @@ def draw_score(
     if len(groups) > MOST_PANELS:
         raise DataError(
             f"the figure of {score} would have {len(groups)} panels, but at most {MOST_PANELS} are "
-            "drawn; draw it from summary.csv"
+            "drawn. Draw it from summary.csv"
         )
     column = study.columns[place]
     levels = dict.fromkeys(layout.find_level(cell, layout.color) for cell in summary.cells)

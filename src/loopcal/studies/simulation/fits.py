@@ -215,7 +215,7 @@ def _fit_products(
     method, robot = cell.content.method, cell.robot
     if cell.layout is None:
         raise DataError(
-            "products of points need 'choice: plane-line' of the poses; add it, or remove "
+            "products of points need 'choice: plane-line' of the poses. Add it, or remove "
             f"'rows: {method.rows}'"
         )
     free, sd = select_free_parameters(robot), np.zeros(len(robot.parameters))

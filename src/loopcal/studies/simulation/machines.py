@@ -147,7 +147,7 @@ def make_instrument(level: InstrumentLevel, noise: NoiseLevel) -> Instrument:
             hint = suggest_names(name, known)
             raise DataError(f"{name!r} is not measured{hint}; unused may name {', '.join(known)}")
     if set(level.unused) >= set(known):
-        raise DataError("all measured columns are unused; leave at least one")
+        raise DataError("all measured columns are unused. Leave at least one")
     return instrument
 
 
@@ -174,7 +174,7 @@ def check_surfaces(instrument: Instrument) -> None:
     if set(kinds) != SURFACES:
         raise DataError(
             "points on planes and lines need an instrument of the kinds plane and line, not "
-            f"{', '.join(kinds)}; write 'kinds: [plane, line]'"
+            f"{', '.join(kinds)}. Write 'kinds: [plane, line]'"
         )
 
 
@@ -227,7 +227,7 @@ def check_effects(effects: EffectsLevel) -> None:
     for name in ("drift", "jump", "thermal", "backlash"):
         if getattr(effects, name) != getattr(plain, name):
             raise DataError(
-                f"points that are held on planes and lines are simulated without {name}; remove it"
+                f"points that are held on planes and lines are simulated without {name}. Remove it"
             )
 
 

@@ -446,7 +446,7 @@ def identify_per_leg(
     """
     if not 0.0 <= epsilon < np.inf:
         raise EstimationError(
-            f"epsilon is {epsilon}; give a finite number above 0, or 0 for all steps"
+            f"epsilon is {epsilon}. Give a finite number above 0, or 0 for all steps"
         )
     _check_actuators(robot)
     observations = _select_full_poses(data)
@@ -467,7 +467,7 @@ def identify_per_leg(
         if not reached:
             lost = f"cannot reach {int((~solution.converged).sum())} of these poses"
             if len(history) == 1:
-                raise EstimationError(f"{robot.name} {lost}; check the readings")
+                raise EstimationError(f"{robot.name} {lost}. Check the readings")
             done = name_count(len(history) - 1, "step")
             raise EstimationError(
                 f"identification leg by leg diverged: {robot.name}, corrected by {done}, {lost}; "
@@ -516,7 +516,7 @@ def _check_members(robot: Mechanism, legs: LegForm, poses: int) -> None:
     most = max(len(members) for members in legs.members)
     if poses < most:
         raise EstimationError(
-            f"{poses} poses are too few for the {most} parameters of a leg; measure at least {most}"
+            f"{poses} poses are too few for the {most} parameters of a leg. Measure at least {most}"
         )
     for leg, members in enumerate(legs.members):
         columns = legs.G[:, leg, members]
@@ -525,7 +525,7 @@ def _check_members(robot: Mechanism, legs: LegForm, poses: int) -> None:
         if rank < len(members):
             raise EstimationError(
                 f"these poses determine {rank} of the {len(members)} parameters of leg {leg + 1} "
-                "(relative rank tolerance 1e-11); use identify"
+                "(relative rank tolerance 1e-11). Use identify"
             )
 
 
@@ -538,12 +538,12 @@ def _select_full_poses(data: Measurements) -> Observations:
         if unknown:
             raise EstimationError(
                 f"identification leg by leg needs poses in known frames, but {unknown[0]} is "
-                "unknown; use identify"
+                "unknown. Use identify"
             )
         if kept.present.shape[1] == 6 and kept.present.all() and len(kept):
             return kept
     raise EstimationError(
-        "identification leg by leg needs full poses of one kind; use identify for other data"
+        "identification leg by leg needs full poses of one kind. Use identify for other data"
     )
 
 

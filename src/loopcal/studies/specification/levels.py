@@ -134,7 +134,7 @@ class PosesLevel(Limited):
             if not whole or self.count < FEWEST_POINTS * self.groups:
                 raise ValueError(
                     f"{self.count} points do not make {self.groups} equal groups of at least "
-                    f"{FEWEST_POINTS}; change count or groups"
+                    f"{FEWEST_POINTS}. Change count or groups"
                 )
 
     @property
@@ -176,12 +176,12 @@ class ErrorsLevel(Limited):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.smallest and self.distribution != "uniform":
-            raise ValueError("smallest belongs to uniform errors; add 'distribution: uniform'")
+            raise ValueError("smallest belongs to uniform errors. Add 'distribution: uniform'")
         is_drawn = self.error_factor != 1.0 or self.distribution != "normal"
         if self.deviations and is_drawn:
             raise ValueError(
-                "deviations are the same in all trials, so error_factor and distribution have no "
-                "effect beside them; remove these"
+                "deviations are equal in all trials, so error_factor and distribution have no "
+                "effect with them. Remove these"
             )
 
 
@@ -260,7 +260,7 @@ class MethodLevel(Limited):
             method = SETTINGS[key][0]
             if getattr(self, key) is not None and self.method != method:
                 raise ValueError(
-                    f"{key} belongs to the method {method}, not to {self.method}; remove it, or "
+                    f"{key} belongs to the method {method}, not to {self.method}. Remove it, or "
                     "change the method"
                 )
 
@@ -270,25 +270,25 @@ class MethodLevel(Limited):
             for key in ("epsilon", "steps"):
                 if getattr(self, key) is not None:
                     raise ValueError(
-                        f"{key} belongs to 'rows: raw' and to the method per-leg; remove it"
+                        f"{key} belongs to 'rows: raw' and to the method per-leg. Remove it"
                     )
         if self.stop and (self.method != PER_LEG or self.epsilon is None):
             raise ValueError(
-                "stop belongs to the method per-leg with epsilon; add these, or remove it"
+                "stop belongs to the method per-leg with epsilon. Add these, or remove it"
             )
         if not self.is_published:
             return
         what = "the method per-leg" if self.method == PER_LEG else f"'rows: {self.rows}'"
         if self.loss != NO_LOSS or self.noise != "given":
-            raise ValueError(f"{what} has no loss and no estimated noise; remove them")
+            raise ValueError(f"{what} has no loss and no estimated noise. Remove them")
         if self.method == PER_LEG and self.rows != "weighted":
-            raise ValueError("the rows of per-leg are raw ones always; remove 'rows'")
+            raise ValueError("the rows of per-leg are raw ones always. Remove 'rows'")
         for needed in ("lam", "keep"):
             if SETTINGS[needed][0] == self.method and getattr(self, needed) is None:
-                raise ValueError(f"{self.method} with {what} needs {needed}; add it")
+                raise ValueError(f"{self.method} with {what} needs {needed}. Add it")
         if self.method == "auto" or (self.method == "map" and self.rows == "raw"):
             raise ValueError(
-                f"{self.method} needs weighted rows; remove {what}, or take another method"
+                f"{self.method} needs weighted rows. Remove {what}, or take another method"
             )
 
 
@@ -344,7 +344,7 @@ class EffectsLevel(Limited):
 
     LIMITS: ClassVar[Mapping[str, Limit]] = {
         "noise": NOT_NEGATIVE,
-        "degrees": Limit(lambda value: value > 2.0, "above 2, so that a sigma exists"),
+        "degrees": Limit(lambda value: value > 2.0, "above 2, for a finite sigma"),
         "correlation": Limit(lambda value: abs(value) < 1.0, "between -1 and 1"),
     }
     noise: float = 1.0
@@ -390,7 +390,7 @@ class Scores(Limited):
     def __post_init__(self) -> None:
         super().__post_init__()
         if (self.limit_position or self.limit_angle) and not self.verdict:
-            raise ValueError("a limit needs 'verdict: true'; add it, or remove the limit")
+            raise ValueError("a limit needs 'verdict: true'. Add it, or remove the limit")
 
 
 @dataclass(frozen=True)

@@ -70,7 +70,7 @@ COLUMNS = (
     ScoreColumn("rank", "1", "number of combinations of parameters that the data determine"),
     ScoreColumn("condition", "1", "condition number of the scaled rows"),
     ScoreColumn("iterations", "1", "steps of the fit"),
-    ScoreColumn("noise_scale", "1", "residuals over stated noise"),
+    ScoreColumn("noise_scale", "1", "residuals over given noise"),
 )
 """Columns of every study."""
 
@@ -128,7 +128,7 @@ def check_question(study: Study, question: Question) -> float:
         raise DataError(f"limit: {error}") from None
     except ValueError:
         raise DataError(
-            f"limit is {question.limit!r}, but {question.score} has no unit; give a number"
+            f"limit is {question.limit!r}, but {question.score} has no unit. Give a number"
         ) from None
 
 

@@ -146,7 +146,7 @@ REFUSED = {
     "another root": ("<robot/>", "the root is <robot>, but <mujoco> is needed"),
     "include": (
         '<mujoco><include file="../x.xml"/></mujoco>',
-        ":1: the included file 'x.xml' cannot be read; put it beside",
+        ":1: the included file 'x.xml' cannot be read. Put it beside",
     ),
     "unknown body": (
         SOURCES["robot.xml"].replace('body2="rod2"', 'body2="rod3"'),

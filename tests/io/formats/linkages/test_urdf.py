@@ -130,7 +130,7 @@ def perturb(robot: Mechanism) -> Mechanism:
 
 
 def test_export_to_urdf_needs_a_file_to_correct(read) -> None:
-    with pytest.raises(DataError, match=r"name the file to correct"):
+    with pytest.raises(DataError, match=r"Name the file to correct"):
         export_robot(ExportSource(read[FIVE_BAR][1]), urdf.FORMAT, None)
 
 
@@ -173,7 +173,7 @@ JOINT = '<joint name="a" type="revolute"><origin xyz="0 0 1"/><parent link="base
         ),
         (
             "<robot><link name='base'/><link name='arm'/>\n" + JOINT + "</robot>",
-            "name the file of its loop closures",
+            "Name the file of its loop closures",
         ),
     ],
 )

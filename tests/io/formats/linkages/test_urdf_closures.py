@@ -193,7 +193,7 @@ BRACE = PIN.replace('"pin"', '"brace"').replace('"0.3 0 0"', '"0.1 0 0"').replac
 REFUSED = {
     "unknown type": (
         FIVE_BAR.replace('"pin" type="revolute"', '"pin" type="planar"'),
-        ":13: constraint 'pin' is of type 'planar'; allowed: fixed, link",
+        ":13: constraint 'pin' is of type 'planar'. Allowed: fixed, link",
     ),
     "unknown link": (
         FIVE_BAR.replace('<child link="rod2"/><child_o', '<child link="rad2"/><child_o'),
@@ -205,7 +205,7 @@ REFUSED = {
     ),
     "no axis": (
         FIVE_BAR.replace('<parent_axis xyz="0 0 1"/>', ""),
-        ":13: constraint 'pin' is revolute and states no axis; add <parent_axis",
+        ":13: constraint 'pin' is revolute and has no axis. Add <parent_axis",
     ),
     "another axis": (
         FIVE_BAR.replace("</constraint>", '<child_axis xyz="1 0 0"/></constraint>'),
@@ -213,7 +213,7 @@ REFUSED = {
     ),
     "no motors": (
         FIVE_BAR.replace(MOTORS, ""),
-        "no motor is named; list the driven joints in 'name_mot:' of a YAML",
+        "no motor is named. List the driven joints in 'name_mot:' of a YAML",
     ),
     "motor of the camera": (
         FIVE_BAR.replace("</robot>", f"{PAN}</robot>"),
@@ -229,11 +229,11 @@ REFUSED = {
     ),
     "loop of another program": (
         FIVE_BAR.replace("</robot>", '<loop_joint name="x"/></robot>'),
-        ":19: <loop_joint type=''> closes a loop in a way that loopcal does not read",
+        ":19: loopcal does not read the loop closure <loop_joint type=''>",
     ),
     "duplicate link": (
         FIVE_BAR.replace('<link name="tip"/>', '<link name="tip"/><link name="tip"/>'),
-        ":2: duplicate link 'tip'; rename one",
+        ":2: duplicate link 'tip'. Rename one",
     ),
     "loops do not close": (
         FIVE_BAR.replace('child_origin xyz="0.3 0 0"', 'child_origin xyz="0.3 0 0.1"'),
@@ -245,13 +245,13 @@ REFUSED = {
     ),
     "loop closed twice": (
         FIVE_BAR.replace(PIN, PIN + PIN.replace('"pin"', '"again"')),
-        ":16: closure 'again' joins the same points of 'rod1' and 'rod2' as 'pin'",
+        ":16: closure 'again' joins 'rod1' and 'rod2' at the points of 'pin' again",
     ),
     "joint type": (
         FIVE_BAR.replace('type="continuous"', 'type="floating"'),
-        ":9: joint 'elbow2' is of type 'floating'; allowed: revolute, continuous",
+        ":9: joint 'elbow2' is of type 'floating'. Allowed: revolute, continuous",
     ),
-    "brace": (FIVE_BAR.replace(MOTORS, BRACE + MOTORS), ":.*the loops leave 'rod1' no motion"),
+    "brace": (FIVE_BAR.replace(MOTORS, BRACE + MOTORS), ":.*the loops lock 'rod1'"),
 }
 
 
@@ -281,7 +281,7 @@ CLOSURES = {
     ),
     "closed twice": (
         "closed_loop: [[elbow1, elbow2], [elbow2, elbow1]]\ntype: [3d, 3d]\nname_mot: [mot1]\n",
-        ":1: closure 'elbow2_ball' joins the same points of 'rod2' and 'rod1' as 'elbow1_ball'",
+        ":1: closure 'elbow2_ball' joins 'rod2' and 'rod1' at the points of 'elbow1_ball' again",
     ),
     "three frames": (
         "closed_loop:\n- [rod1, rod2]\n- [rod1, rod2, tip]\ntype: [3d, 3d]\n",
@@ -302,7 +302,7 @@ CLOSURES = {
     ),
     "replacement": (
         "name_mot: [mot1]\njoint_name: [elbow1]\njoint_type: [BALL]\n",
-        ":3: joint 'elbow1' is replaced by 'BALL'; allowed: SPHERICAL, FIXED, UJOINT_XY",
+        ":3: joint 'elbow1' is replaced by 'BALL'. Allowed: SPHERICAL, FIXED, UJOINT_XY",
     ),
     "replaced joint": (
         "name_mot: [mot1]\njoint_name: [elbow]\njoint_type: [FIXED]\n",
@@ -314,7 +314,7 @@ CLOSURES = {
     ),
     "lists": (
         "name_mot: [mot1]\njoint_name: [elbow1]\n",
-        "'joint_type:' must be lists of the same length",
+        "'joint_type:' must be lists of equal length",
     ),
 }
 

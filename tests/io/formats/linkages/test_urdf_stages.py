@@ -192,13 +192,13 @@ def test_tips_of_a_humanoid_are_listed(tmp_path) -> None:
     sole = write_element("sole_frame", "fixed", "right_foot", "sole", np.eye(4))
     two = path.read_text().replace("</robot>", f'<link name="sole"/>{sole}</robot>')
     path.write_text(two)
-    with pytest.raises(LoopcalError, match=r"name its link, one of tool and sole$"):
+    with pytest.raises(LoopcalError, match=r"Name its link, one of tool and sole$"):
         read(path)
     with pytest.raises(LoopcalError, match=r"'head' is not a moving link .* one of tool and sole$"):
         read(path, "head")
     bare = two[: two.index('<joint name="tool_frame"')].replace('<link name="tool"/>', "")
     path.write_text(f"{bare}</robot>")
-    with pytest.raises(LoopcalError, match=r"name its link, one of platform and right_foot$"):
+    with pytest.raises(LoopcalError, match=r"Name its link, one of platform and right_foot$"):
         read(path)
 
 

@@ -71,10 +71,10 @@ def test_new_lines_state_the_length_at_reading_zero(source, tmp_path, monkeypatc
 def test_files_without_what_is_needed_are_refused(source, tmp_path) -> None:
     file = tmp_path / "machine.ini"
     file.write_text(make_ini().replace("HOME_OFFSET= 253.5\n", ""))
-    with pytest.raises(FileError, match=r"\[JOINT_3\] has no HOME_OFFSET; add"):
+    with pytest.raises(FileError, match=r"\[JOINT_3\] has no HOME_OFFSET. Add"):
         export(source, file)
     file.write_text(make_ini("furlong"))
-    with pytest.raises(FileError, match=r"machine.ini:4: LINEAR_UNITS is 'furlong'; allowed: mm"):
+    with pytest.raises(FileError, match=r"machine.ini:4: LINEAR_UNITS is 'furlong'. Allowed: mm"):
         export(source, file)
     with pytest.raises(DataError, match="holds no other"):
         export(ExportSource(load_robot("linear-delta")), file)
@@ -86,7 +86,7 @@ def test_readings_that_are_lengths_need_the_file(tmp_path) -> None:
         .record.text.replace("lengths: 233.238076", "lengths: 0")
         .replace("stroke: [-75, 75]", "stroke: [150, 310]")
     )
-    with pytest.raises(DataError, match="name the INI file to correct"):
+    with pytest.raises(DataError, match="Name the INI file to correct"):
         export(ExportSource(load_robot(tmp_path / "h.yaml")), None)
 
 

@@ -179,7 +179,7 @@ def _read_closures(path: Path, tree: LinkTree) -> Closures:
     _check_lists(file, pairs, kinds, motors)
     for i, kind in enumerate(kinds):
         if str(kind).lower() not in (WELD, PIN, BALL):
-            sentence = f"closure {pairs[i][0]!r} is of type {quote(str(kind))}; allowed: 6d (the"
+            sentence = f"closure {pairs[i][0]!r} is of type {quote(str(kind))}. Allowed: 6d (the"
             sentence += " frames coincide), 5d (their z axes do), 3d (their origins do)"
             raise file.error(sentence, ("type", i))
     return Closures(
@@ -202,7 +202,7 @@ def _check_lists(file: YamlFile, pairs: Any, kinds: Any, motors: Any) -> None:
             raise file.error(f"{sentence}: [A, B]", ("closed_loop", i))
     if len(kinds) != len(pairs):
         sentence = f"'closed_loop' has {len(pairs)} pairs, but 'type' has {len(kinds)} entries"
-        raise file.error(f"{sentence}; write 6d or 3d for each pair", ("type",))
+        raise file.error(f"{sentence}. Write 6d or 3d for each pair", ("type",))
 
 
 def find_closures(path: Path) -> Path | None:
@@ -224,7 +224,7 @@ def _read_pins(file: YamlFile, tree: LinkTree) -> tuple[Constraint, ...]:
     for i, entry in enumerate(listed):
         place = (PINS[0], i)
         if not isinstance(entry, dict) or not {"link_a", "link_b", "point", "axis"} <= {*entry}:
-            sentence = f"closure {i + 1} needs link_a, link_b, point and axis; write all four"
+            sentence = f"closure {i + 1} needs link_a, link_b, point and axis. Write all four"
             raise file.error(sentence, place)
         links, vectors = (str(entry["link_a"]), str(entry["link_b"])), []
         for link in links:
@@ -232,16 +232,16 @@ def _read_pins(file: YamlFile, tree: LinkTree) -> tuple[Constraint, ...]:
                 sentence = (
                     f"closure {i + 1} names {link!r}, which is not a link of {tree.path.name}"
                 )
-                raise file.error(f"{sentence}{suggest_names(link, drawn)}; correct it", place)
+                raise file.error(f"{sentence}{suggest_names(link, drawn)}. Correct it", place)
         for key in ("point", "axis"):
             numbers = entry[key] if isinstance(entry[key], list) else []
             if [type(v) in (int, float) for v in numbers] != [True] * 3:
-                sentence = f"{key} of closure {i + 1} must be three numbers; correct it"
+                sentence = f"{key} of closure {i + 1} must be three numbers. Correct it"
                 raise file.error(sentence, place)
             vectors.append(np.array(numbers, dtype=np.float64))
         point, axis = vectors
         if not np.linalg.norm(axis) > 0:
-            raise file.error(f"closure {i + 1} has the axis 0 0 0; write a direction", place)
+            raise file.error(f"closure {i + 1} has the axis 0 0 0. Write a direction", place)
         name, frame = "_".join(links), geometry.make_pose(np.eye(3), point)
         ends = [
             make_end(name, end, link, derive_end(drawn, link, tree.root, frame), 0)
@@ -255,19 +255,19 @@ def _read_pins(file: YamlFile, tree: LinkTree) -> tuple[Constraint, ...]:
 def _read_overrides(file: YamlFile, names: Any, types: Any, tree: LinkTree) -> dict[str, str]:
     """Return joint -> type of the joints that a closure file replaces."""
     if not isinstance(names, list) or not isinstance(types, list) or len(names) != len(types):
-        sentence = "'joint_name:' and 'joint_type:' must be lists of the same length; correct them"
+        sentence = "'joint_name:' and 'joint_type:' must be lists of equal length. Correct them"
         raise file.error(sentence, ("joint_name",))
     overrides: dict[str, str] = {}
     for i, (name, kind) in enumerate(zip(map(str, names), map(str, types), strict=True)):
         if name not in tree.joints or not tree.joints[name].kind:
             near = suggest_names(name, [n for n, joint in tree.joints.items() if joint.kind])
             sentence = f"{quote(name)} is not a movable joint of {tree.path.name}{near}"
-            raise file.error(f"{sentence}; correct it", ("joint_name", i))
+            raise file.error(f"{sentence}. Correct it", ("joint_name", i))
         if kind.upper() not in OVERRIDES:
-            sentence = f"joint {name!r} is replaced by {quote(kind)}; allowed: "
+            sentence = f"joint {name!r} is replaced by {quote(kind)}. Allowed: "
             raise file.error(sentence + ", ".join(OVERRIDES), ("joint_type", i))
         if name in overrides:
-            raise file.error(f"joint {name!r} is replaced twice; remove one", ("joint_name", i))
+            raise file.error(f"joint {name!r} is replaced twice. Remove one", ("joint_name", i))
         overrides[name] = kind.upper()
     return overrides
 
@@ -277,7 +277,7 @@ def _check_motors(tree: LinkTree, closures: Closures, motors: Sequence[str]) -> 
     ends = {name for pair in closures.pairs for name in pair}
     for i, name in enumerate(motors):
         if name in motors[:i] and closures.file is not None:
-            raise closures.file.error(f"motor {name!r} is named twice; remove one", ("name_mot", i))
+            raise closures.file.error(f"motor {name!r} is named twice. Remove one", ("name_mot", i))
         joint = tree.joints.get(name)
         if joint is not None and joint.kind and name not in ends | {*closures.overrides}:
             continue
@@ -288,15 +288,15 @@ def _check_motors(tree: LinkTree, closures: Closures, motors: Sequence[str]) -> 
             reason += " a loop"
         elif name in closures.overrides:
             reason = "is not a movable joint that a motor can drive: joint_type replaces it"
-        sentence = f"the motor {quote(name)} {reason}; correct it"
+        sentence = f"the motor {quote(name)} {reason}. Correct it"
         if closures.file is None or name not in closures.motors:
             raise FileError(sentence, tree.path, tree.motors.get(name))
         raise closures.file.error(sentence, ("name_mot", i))
     if not motors:
-        sentence = "no motor is named; list the driven joints in 'name_mot:'"
+        sentence = "no motor is named. List the driven joints in 'name_mot:'"
         if closures.file is not None:
             raise closures.file.error(sentence)
-        raise FileError(f"{sentence} of a YAML file beside it", tree.path)
+        raise FileError(f"{sentence} of a YAML file in its folder", tree.path)
 
 
 def _find_link(tree: LinkTree, name: str) -> str | None:
@@ -313,7 +313,7 @@ def _build_closure(
     file = closures.file
     assert file is not None
     if pair[0] == pair[1]:
-        sentence = f"closure {i + 1} names the frame {pair[0]!r} twice; name two frames"
+        sentence = f"closure {i + 1} names the frame {pair[0]!r} twice. Name two frames"
         raise file.error(sentence, ("closed_loop", i))
     ends: list[tuple[str, FloatArray, str]] = []
     for name in pair:
@@ -321,7 +321,7 @@ def _build_closure(
         if link is None:
             near = suggest_names(name, [*tree.joints, *tree.carrier])
             sentence = f"the closure {quote(name)} is not a joint or link of {tree.path.name}"
-            raise file.error(f"{sentence}{near}; correct it", ("closed_loop", i))
+            raise file.error(f"{sentence}{near}. Correct it", ("closed_loop", i))
         carrier = tree.carrier.get(link)
         origin = carrier.name if carrier is not None and not carrier.kind else ""
         ends.append((tree.find_body(link), tree.place_in_body(link), origin))

@@ -231,7 +231,7 @@ def _check_place(tree: LinkTree, name: str, stated: FloatArray) -> None:
     rounding = sum(sum(other.rounding) for other in tree.places.values())
     if np.abs(place - stated).max() > PLACED + rounding:
         sentence = f"joint {name!r} has another place in the robot file"
-        raise tree.error(f"{sentence}; export into the file it was read from", name)
+        raise tree.error(f"{sentence}. Export into the file it was read from", name)
 
 
 LARGE = 30.0
@@ -688,7 +688,7 @@ def _describe_drive(tree: LinkTree, motor: TreeJoint, lead: GraphJoint) -> Conte
     """Return one drive of the robot file; its joint may be one that follows the motor."""
     if (motor.kind, lead.kind) == ("P", "R"):
         sentence = f"joint {lead.name!r} turns with the slide {motor.name!r}, which moves nothing "
-        raise tree.error(f"{sentence}else of this platform; name the joint as motor", lead.name)
+        raise tree.error(f"{sentence}else of this platform. Name the joint as motor", lead.name)
     gain = "gain" if motor.kind == lead.kind else "radius"
     law = {} if lead.is_plain else {gain: lead.ratio, "offset": lead.offset}
     reads = "angle" if motor.kind == "R" else "length"

@@ -87,7 +87,7 @@ class _Reader:
             self.sequence = stated.get("eulerseq", self.sequence)
             self.limited = stated.get("autolimits", "true") == "true"
             if stated.get("coordinate", "local") != "local":
-                raise compiler.error("coordinates are global; write coordinate='local'")
+                raise compiler.error("coordinates are global. Write coordinate='local'")
         for default in self.root.find_all("default"):
             self._read_defaults(default, {})
 
@@ -121,7 +121,7 @@ class _Reader:
             count = {"quat": 4, "axisangle": 4, "euler": 3, "xyaxes": 6, "zaxis": 3}[turn]
             numbers = element.parse_numbers(stated[turn], count, f"{turn} of {what}")
             if turn != "euler" and not np.linalg.norm(numbers[: 3 if turn != "quat" else 4]) > 0:
-                raise element.error(f"{turn} of {what} is zero; write a direction")
+                raise element.error(f"{turn} of {what} is zero. Write a direction")
             R = self._find_rotation(turn, numbers)
         return geometry.make_pose(R, position)
 
@@ -157,7 +157,7 @@ class _Reader:
         if element.name == "body":
             name = element.attributes.get("name") or f"body {len(self.bodies)}"
             if name in self.bodies:
-                raise element.error(f"duplicate body {name!r}; rename one")
+                raise element.error(f"duplicate body {name!r}. Rename one")
             T_body = T_parent @ self.parse_pose(element, element.attributes)
             self.bodies[name] = self.bodies[parent] @ T_body
             self.elements[name], self.carriers[name] = element, parent
@@ -171,7 +171,7 @@ class _Reader:
                 self.sites[child.attributes["name"]] = parent, place, child
             elif child.name in ("replicate", "attach", "composite", "flexcomp"):
                 sentence = f"<{child.name}> makes bodies that the file does not write"
-                raise child.error(f"{sentence}; save the model from MuJoCo with all bodies first")
+                raise child.error(f"{sentence}. Save the model from MuJoCo with all bodies first")
 
     def _read_joints(
         self, element: Element, body: str, parent: str, T_body: FloatArray, inherited: str
@@ -188,13 +188,13 @@ class _Reader:
                 break
             if kind not in KINDS:
                 allowed = ", ".join((*KINDS, "free"))
-                raise joint.error(f"a joint of {body!r} is of type {kind!r}; allowed: {allowed}")
+                raise joint.error(f"a joint of {body!r} is of type {kind!r}. Allowed: {allowed}")
             name = stated.get("name") or f"joint {i + 1} of {body}"
             texts = stated.get("pos", "0 0 0"), stated.get("axis", "0 0 1")
             center = joint.parse_numbers(texts[0], 3, f"pos of joint {name!r}")
             axis = joint.parse_numbers(texts[1], 3, f"axis of joint {name!r}")
             if not np.linalg.norm(axis) > 0:
-                raise joint.error(f"joint {name!r} has the axis 0 0 0; write a direction")
+                raise joint.error(f"joint {name!r} has the axis 0 0 0. Write a direction")
             place = geometry.make_pose(np.eye(3), center)
             link = f"{body} at {name}"
             where = element.attributes
@@ -258,7 +258,7 @@ def _include(root: Element, path: Path) -> Element:
             other = path.parent / name
             is_beside = not name.is_absolute() and ".." not in name.parts
             if count >= MOST_INCLUDES or not is_beside or not other.is_file():
-                raise child.error(f"the included file {other.name!r} cannot be read; put it beside")
+                raise child.error(f"the included file {other.name!r} cannot be read. Put it beside")
             inner = parse_xml(read_text(other, WHAT), other, WHAT)
             expand(inner, count + 1)
             children += inner.children
@@ -273,7 +273,7 @@ def read_tree(path: Path) -> LinkTree:
     text = read_text(path, WHAT)
     root = parse_xml(text, path, WHAT)
     if root.name != "mujoco":
-        raise FileError(f"the root is <{root.name}>, but <mujoco> is needed; check the file", path)
+        raise FileError(f"the root is <{root.name}>, but <mujoco> is needed. Check the file", path)
     reader = _Reader(_include(root, path))
     reader.read_all()
     top = _choose_root(reader)
@@ -548,7 +548,7 @@ def _replace(
     """Return the edit of an attribute, which is added where it is missing."""
     if element.path != tree.path:
         sentence = f"{element.attributes.get('name', element.name)!r} is in an included file"
-        raise element.error(f"{sentence}; write it into {tree.path.name}")
+        raise element.error(f"{sentence}. Write it into {tree.path.name}")
     edit = element.replace_attribute(raw, attribute, values)
     after_name = element.start + 1 + len(element.name)
     added = f' {attribute}="{format_numbers(values)}"'

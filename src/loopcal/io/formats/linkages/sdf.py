@@ -126,7 +126,7 @@ class Frames:
             user = self.elements[by[-1]] if by else next(iter(self.elements.values()))
             circle = "which is placed by itself" if element is not None else "which does not exist"
             near = suggest_names(name, [*self.elements])
-            raise user.error(f"{by[-1] if by else ''!r} names {name!r}, {circle}{near}; correct it")
+            raise user.error(f"{by[-1] if by else ''!r} names {name!r}, {circle}{near}. Correct it")
         return self.place_element(element, (*by, name))
 
     def place_element(self, element: Element, by: tuple[str, ...] = ()) -> FloatArray:
@@ -149,14 +149,14 @@ def _read_joint(
     name, stated = element.attributes.get("name", ""), element.attributes.get("type", "")
     if stated not in (*KINDS, GEARBOX):
         allowed = ", ".join((*KINDS, GEARBOX))
-        raise element.error(f"joint {name!r} is of type {stated!r}; allowed: {allowed}")
+        raise element.error(f"joint {name!r} is of type {stated!r}. Allowed: {allowed}")
     parent, child = (
         element.get(end) or (getattr(element.find(end), "attributes", {}).get("link", ""))
         for end in ("parent", "child")
     )
     if not parent or not child:
         needed = "child" if parent else "parent"
-        raise element.error(f"joint {name!r} names no {needed} link; add <{needed}>")
+        raise element.error(f"joint {name!r} names no {needed} link. Add <{needed}>")
     axes, texts, limits = np.eye(3)[[2, 2]], [], None
     R_joint = (frames.place(child) @ T_child_joint)[:3, :3]
     for i, key in enumerate(("axis", "axis2")):
@@ -166,7 +166,7 @@ def _read_joint(
         texts.append(axis.get("xyz") or "0 0 1")
         vector = element.parse_numbers(texts[-1], 3, f"the axis of joint {name!r}")
         if not np.linalg.norm(vector) > 0:
-            raise element.error(f"joint {name!r} has the axis 0 0 0; write a direction")
+            raise element.error(f"joint {name!r} has the axis 0 0 0. Write a direction")
         xyz = axis.find("xyz")
         frame = "" if xyz is None else xyz.attributes.get("expressed_in", "")
         if frame or in_model or axis.get("use_parent_model_frame") in ("1", "true"):
@@ -191,7 +191,7 @@ def list_embedded_constraints(tree: LinkTree, parts: Sequence[Element]) -> LinkT
         for link in (joint.parent, joint.child):
             if link not in drawn:
                 sentence = f"joint {joint.name!r} names the link {link!r}, which does not exist"
-                raise element.error(f"{sentence}{suggest_names(link, drawn)}; correct it")
+                raise element.error(f"{sentence}{suggest_names(link, drawn)}. Correct it")
         if joint.name in tree.joints or joint.kind == GEARBOX:
             raise element.error(report_finding("files.urdf-other-loop", element=joint.name))
         found.append(joint.close(drawn))
@@ -213,7 +213,7 @@ def read_tree(path: Path) -> LinkTree:
     models = [element for element in root.walk() if element.name == "model"]
     if root.name != "sdf" or len(models) != 1:
         sentence = f"this SDF file has {len(models)} models, but one without others in it is needed"
-        raise FileError(f"{sentence}; write one model into a file of its own", path)
+        raise FileError(f"{sentence}. Write one model into a separate file", path)
     (model,) = models
     in_model = root.attributes.get("version", "1.7") in ("1.0", "1.2", "1.3", "1.4")
     frames, joints = Frames(_find_elements(model), {}), []
@@ -228,7 +228,7 @@ def read_tree(path: Path) -> LinkTree:
         for link in (joint.parent, joint.child):
             if link not in drawn:
                 sentence = f"joint {joint.name!r} names the link {link!r}, which does not exist"
-                raise joint.element.error(f"{sentence}{suggest_names(link, drawn)}; correct it")
+                raise joint.element.error(f"{sentence}{suggest_names(link, drawn)}. Correct it")
     geared = [joint for joint in joints if joint.kind == GEARBOX]
     carried, closing = _span(list(drawn), [j for j in joints if j.kind != GEARBOX])
     tree = [part for joint in carried for part in _carry(joint, drawn)]
@@ -357,7 +357,7 @@ def _write_axis(element: Element, axis: FloatArray, frames: Frames) -> Edit:
     xyz = element.find("axis", "xyz")
     name = element.attributes.get("name", "")
     if xyz is None or xyz.attributes.get("expressed_in"):
-        raise element.error(f"the axis of {name!r} turns; write it in the frame of the joint")
+        raise element.error(f"the axis of {name!r} turns. Write it in the frame of the joint")
     if element.get("axis", "use_parent_model_frame") in ("1", "true"):
         axis = frames.place_element(element)[:3, :3] @ axis
     return xyz.end, xyz.close, format_numbers(axis)
@@ -369,7 +369,7 @@ def write_pose(tree: LinkTree, element: Element, T: FloatArray, stated: FloatArr
     if pose is None:
         if tree.text.encode()[element.end - 2 : element.end] == b"/>":
             name = element.attributes.get("name", "")
-            raise element.error(f"{element.name} {name!r} has no pose; add one")
+            raise element.error(f"{element.name} {name!r} has no pose. Add one")
         values = [*T[:3, 3], *geometry.matrix_to_euler(T[:3, :3], "xyz")]
         return element.end, element.end, f"<pose>{format_numbers(values)}</pose>"
     angles = format_numbers(geometry.matrix_to_euler(T[:3, :3], "xyz"))

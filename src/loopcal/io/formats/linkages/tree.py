@@ -160,7 +160,7 @@ def build_tree(
     named: dict[str, dict[str, int]] = {"joint": {}, "constraint": {}}
     for sort, entry in (*(("joint", j) for j in joints), *(("constraint", c) for c in constraints)):
         if entry.name in named[sort]:
-            raise FileError(f"duplicate {sort} {entry.name!r}; rename one", path, entry.line)
+            raise FileError(f"duplicate {sort} {entry.name!r}. Rename one", path, entry.line)
         if (fault := find_fault(entry.name)) is not None:
             raise FileError(fault, path, entry.line)
         named[sort][entry.name] = entry.line
@@ -171,24 +171,24 @@ def build_tree(
         for link in (joint.parent, joint.child):
             if link not in known:
                 sentence = f"joint {joint.name!r} names the link {link!r}, which does not exist"
-                raise FileError(f"{sentence}; correct it", path, joint.line)
+                raise FileError(f"{sentence}. Correct it", path, joint.line)
         if joint.child in carrier:
             other = carrier[joint.child].name
             sentence = f"link {joint.child!r} is the child of {other!r} and of {joint.name!r}"
-            raise FileError(f"{sentence}, but a URDF is a tree; correct it", path, joint.line)
+            raise FileError(f"{sentence}, but a URDF is a tree. Correct it", path, joint.line)
         carrier[joint.child] = joint
     roots = [link for link in links if link not in carrier]
     if len(roots) != 1:
         listed = ", ".join(roots[:4])
         sentence = f"this {what.removesuffix(' file')} has {len(roots)} root links ({listed})"
-        raise FileError(f"{sentence}, but one is needed; join them", path)
+        raise FileError(f"{sentence}, but one is needed. Join them", path)
     _refuse_cycles(path, links, roots[0], carrier)
     for constraint in constraints:
         for link in (end.parent for end in constraint.ends):
             if link not in known:
                 sentence = f"constraint {constraint.name!r} names the link {link!r}"
                 sentence += f", which does not exist{suggest_names(link, links)}"
-                raise FileError(f"{sentence}; correct it", path, constraint.line)
+                raise FileError(f"{sentence}. Correct it", path, constraint.line)
     tree = {joint.name: joint for joint in joints}
     return LinkTree(path, text, tree, roots[0], carrier, tuple(constraints), motors, rewrite)
 
@@ -207,7 +207,7 @@ def _refuse_cycles(
         if link in chain:
             joint = carrier[link]
             sentence = f"joint {joint.name!r} closes a circle of links: {joint.child!r} is carried"
-            raise FileError(f"{sentence} by itself; correct its parent", path, joint.line)
+            raise FileError(f"{sentence} by itself. Correct its parent", path, joint.line)
         carried |= chain.keys()
 
 

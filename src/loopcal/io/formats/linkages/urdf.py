@@ -68,7 +68,7 @@ def parse(text: str, path: Path) -> LinkTree:
     for link in (part for part in parts if part.name == "link"):
         name = link.attributes.get("name", "")
         if name in links:
-            raise link.error(f"duplicate link {name!r}; rename one")
+            raise link.error(f"duplicate link {name!r}. Rename one")
         links[name] = None
     joints = [_build_joint(part) for part in parts if part.name == "joint"]
     constraints = [_build_constraint(part) for part in parts if part.name == "constraint"]
@@ -114,7 +114,7 @@ def _build_joint(element: Element) -> TreeJoint:
     """Return a joint from its elements."""
     name, stated = element.attributes.get("name", ""), element.attributes.get("type", "")
     if stated not in KINDS:
-        sentence = f"joint {name!r} is of type {stated!r}; allowed: {', '.join(KINDS)}"
+        sentence = f"joint {name!r} is of type {stated!r}. Allowed: {', '.join(KINDS)}"
         raise element.error(sentence)
     parent, child = _get_links(element)
     kind, limit = KINDS[stated], _get_attributes(element, "limit")
@@ -148,7 +148,7 @@ def _build_constraint(element: Element) -> Constraint:
     name, stated = element.attributes.get("name", ""), element.attributes.get("type", "")
     what = f"constraint {name!r}"
     if stated.lower() not in CONSTRAINTS:
-        sentence = f"{what} is of type {stated!r}; allowed: {', '.join(CONSTRAINTS)}"
+        sentence = f"{what} is of type {stated!r}. Allowed: {', '.join(CONSTRAINTS)}"
         raise element.error(sentence)
     kind = CONSTRAINTS[stated.lower()]
     first, second = (
@@ -166,7 +166,7 @@ def _build_constraint(element: Element) -> Constraint:
     given = [end for end in ("parent", "child") if element.find(f"{end}_axis") is not None]
     needed = {"R": ["parent"], "P": ["parent"], "U": ["parent", "child"]}.get(kind, [])
     if missing := [end for end in needed if end not in given]:
-        sentence = f"{what} is {stated} and states no axis; add <{missing[0]}_axis xyz=..>"
+        sentence = f"{what} is {stated} and has no axis. Add <{missing[0]}_axis xyz=..>"
         raise element.error(sentence)
     axes = {
         end: _parse_axis(element, f"{end}_axis", what) if end in needed else np.eye(3)[2]
@@ -217,7 +217,7 @@ def _get_links(element: Element) -> tuple[str, str]:
     parent, child = (_get_attributes(element, end).get("link", "") for end in ("parent", "child"))
     if not parent or not child:
         needed, name = "child" if parent else "parent", element.attributes.get("name", "")
-        sentence = f"{element.name} {name!r} names no {needed} link; add <{needed} link=..>"
+        sentence = f"{element.name} {name!r} names no {needed} link. Add <{needed} link=..>"
         raise element.error(sentence)
     return parent, child
 
@@ -235,7 +235,7 @@ def _parse_axis(element: Element, name: str, what: str) -> FloatArray:
     vector = element.parse_numbers(text, 3, f"the axis of {what}")
     length = float(np.linalg.norm(vector))
     if not length > 0:
-        raise element.error(f"{what} has the axis 0 0 0; write a direction")
+        raise element.error(f"{what} has the axis 0 0 0. Write a direction")
     return vector / length
 
 
@@ -252,7 +252,7 @@ def rewrite(before: LinkTree, after: LinkTree) -> str:
         ):
             continue  # as it was, or the derived end of a constraint
         if place.element is None:
-            raise before.error(f"{name!r} has no origin element; add one with xyz and rpy", name)
+            raise before.error(f"{name!r} has no origin element. Add one with xyz and rpy", name)
         if place.element.name == "joint":  # of SDF inside <gazebo>
             edits.append(write_pose(before, place.element, origin, place.origin))
             continue
@@ -262,7 +262,7 @@ def rewrite(before: LinkTree, after: LinkTree) -> str:
         for attribute, numbers in values.items():
             edit = place.element.replace_attribute(raw, attribute, numbers)
             if edit is None:
-                raise before.error(f"the origin of {name!r} has no {attribute}; add it", name)
+                raise before.error(f"the origin of {name!r} has no {attribute}. Add it", name)
             edits.append(edit)
     return apply_edits(before.text, edits)
 

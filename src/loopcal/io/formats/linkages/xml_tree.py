@@ -72,7 +72,7 @@ class Element:
         numbers = text.split()
         if len(numbers) != count:
             words = {1: "one number is", 3: "three numbers are"}.get(count, f"{count} numbers are")
-            raise self.error(f"{what} is {text!r}, but {words} needed; correct it")
+            raise self.error(f"{what} is {text!r}, but {words} needed. Correct it")
         return np.array([parse_number(number, what, self.path, self.line) for number in numbers])
 
     def replace_attribute(self, raw: bytes, name: str, values: FloatArray) -> Edit | None:
@@ -150,7 +150,7 @@ def parse_xml(text: str, path: Path, what: str) -> Element:
             stack[-1].text += characters
 
     def refuse_doctype(*_: Any) -> None:
-        sentence = f"a {what.removesuffix(' file')} has no document type; remove <!DOCTYPE ..>"
+        sentence = f"a {what.removesuffix(' file')} has no document type. Remove <!DOCTYPE ..>"
         raise FileError(sentence, path, parser.CurrentLineNumber)
 
     parser.StartElementHandler, parser.EndElementHandler = start, end
@@ -159,7 +159,7 @@ def parse_xml(text: str, path: Path, what: str) -> Element:
     try:
         parser.Parse(raw, True)
     except expat.ExpatError as error:
-        sentence = f"not valid XML ({expat.ErrorString(error.code)}); correct it"
+        sentence = f"not valid XML ({expat.ErrorString(error.code)}). Correct it"
         raise FileError(sentence, path, error.lineno) from None
     return found[0]
 
