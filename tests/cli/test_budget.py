@@ -53,7 +53,7 @@ def test_a_run_of_an_earlier_version_is_refused_with_what_to_do(loopcal, run):
     content = json.loads(path.read_text())
     del content["expected_error"]["sources"]
     path.write_text(json.dumps(content))
-    loopcal(f"budget {run}", "contains no uncertainty budget", code=1)
+    loopcal(f"budget {run}", "the uncertainty budget of", code=1)
 
 
 def test_the_largest_error_in_a_volume_is_stated_for_all_points_and_for_each(loopcal, run, capsys):
@@ -89,7 +89,7 @@ def test_points_of_a_file_and_a_limit_decide_the_exit_code(loopcal, run):
     )
     failed = loopcal(f"accuracy {run} --volume points.csv --limit-position 1nm", code=2)
     assert "does not conform" in failed.err
-    loopcal(f"accuracy {run} --volume points.csv --volume x=1mm", "beside other parts", code=1)
+    loopcal(f"accuracy {run} --volume points.csv --volume x=1mm", "with other parts", code=1)
     Path("points.csv").write_text(POINTS.replace("roll", "rolle"))
     loopcal(f"accuracy {run} --volume points.csv", "points.csv:1", code=1)
 

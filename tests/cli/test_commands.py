@@ -51,7 +51,7 @@ def test_calibrate_without_a_folder_shows_the_same_result_and_writes_nothing(
     shown = loopcal("calibrate hexapod-42 measurements.csv").out
     assert sorted(tmp_path.iterdir()) == before
     page, _, last = shown.strip().rpartition("\n\n")
-    note = "Nothing was written; -o RUN keeps the result and the corrected robot file."
+    note = "No file written: use -o RUN to keep the result and the corrected robot file."
     assert " ".join(last.split()) == note
     assert loopcal(CALIBRATE).out.strip().rpartition("\n\n")[0] == page
 

@@ -138,7 +138,7 @@ def test_region_shows_intervals_for_all_at_once_and_the_joint_region(loopcal, fo
         (["sample", "RUN", "--region", "--seed", "1"], "--seed has no effect with --region"),
         (["sample", "RUN", "-p", "leg1.base.x"], "has no effect without --region"),
         (["bootstrap", "hexapod-42"], "run folder"),
-        (["sample", "DATA"], "give a run folder, or the files of measurements after"),
+        (["sample", "DATA"], "Give a run folder, or a robot file and then files"),
     ],
 )
 def test_wrong_use_is_refused_in_one_sentence(loopcal, folder, words, text) -> None:

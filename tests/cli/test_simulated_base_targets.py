@@ -23,4 +23,4 @@ def test_help_says_how_targets_on_the_base_are_simulated(capsys) -> None:
     main(["simulate", "--help"])
     text = " ".join(capsys.readouterr().out.split())
     assert "of: base" in text
-    assert "measured with --fill only" in text
+    assert "need --fill" in text

@@ -194,7 +194,7 @@ def test_unknown_excluded_poses_and_nonpositive_loss_constants_are_refused():
     data = hexapod_data(20)
     with pytest.raises(DataError, match="no pose '99' to exclude"):
         identify(hexapod(), data, options=FitOptions(excluded_poses=("99",)))
-    with pytest.raises(DataError, match="give a sequence of labels"):
+    with pytest.raises(DataError, match="Give a sequence of labels"):
         identify(hexapod(), data, options=FitOptions(excluded_poses="12"))
     with pytest.raises(EstimationError, match="Huber loss with constant 0"):
         Huber(0.0)

@@ -170,8 +170,8 @@ def test_what_a_run_lacks_is_stated_in_one_sentence(run) -> None:
     for sentence in (
         "No pose was held out of this fit",
         "does not contain the labels of its residuals",
-        "does not contain the readings of its poses",
-        "the accuracy over the workspace is not known",
+        "lacks the readings of its poses",
+        "the accuracy over the workspace is unknown",
         "there is no uncertainty budget",
         "does not name its fitted poses",
         "No pose was held out.",

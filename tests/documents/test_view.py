@@ -121,7 +121,7 @@ def test_page_opens_in_a_browser_only_where_there_is_a_display(
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
     assert main(["view", "five-bar"]) == 0
-    assert capsys.readouterr().out == "Written to view.html; no browser could be started here\n"
+    assert capsys.readouterr().out == "Written to view.html, but no browser starts here\n"
     assert opened == []
     monkeypatch.setenv("DISPLAY", ":0")
     assert main(["view", "five-bar", "--force", "--json"]) == 0

@@ -484,7 +484,7 @@ def test_exact_readings_of_redundant_actuators_are_refused(cable):
         reading_sigma=0.0,
     )
     with pytest.raises(
-        DataError, match="redundant actuators cannot be exact: state a sigma above 0"
+        DataError, match=r"redundant actuators cannot be exact. Give each a sigma above 0"
     ):
         identify(robot, data, LeastSquares())
 

@@ -141,7 +141,7 @@ WRONG_SETS = {
         "data.target-on-two-bodies",
     ),
     "one target": ({"points": POSES, "base": ONE}, "base.csv:3", "data.single-base-target"),
-    "the base alone": ({"base": BASE}, "give the file of the poses", None),
+    "the base alone": ({"base": BASE}, "Give the file of the poses", None),
     "a kind that measures no points": (
         {"points": PLANE.replace("kind: position", "kind: plane")},
         "position, bearing or distance",

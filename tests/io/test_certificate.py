@@ -210,7 +210,7 @@ def test_certificate_follows_the_schema_and_states_the_run(tmp_path, run) -> Non
     content = json.loads((run / "result.json").read_text("utf-8"))
     assert verdict.startswith(content["headline"])
     assert content["expected_error"]["finding"]["text"] in verdict
-    assert "do not cover errors that did not act" in verdict
+    assert "do not cover influences outside" in verdict
     warnings = [f["text"] for f in content["findings"] if f["severity"] == "warning"]
     assert all(text in verdict for text in warnings)
     judged = content["validation"]["conformity"]["position"]

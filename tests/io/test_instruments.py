@@ -108,7 +108,7 @@ def test_wrong_facts_are_refused_at_their_line(tmp_path, robot, data, setting, m
 
 
 def test_dates_are_checked_in_python() -> None:
-    with pytest.raises(DataError, match="write a date"):
+    with pytest.raises(DataError, match="Write a date"):
         lc.InstrumentRecord(measured="20260531")
 
 

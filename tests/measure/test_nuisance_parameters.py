@@ -109,7 +109,7 @@ def test_priors_and_values_are_set_by_name_or_pattern():
         local.values({"traker.x": 1.0})
     with pytest.raises(DataError, match="no setup parameter 'camera"):
         local.with_fixed("camera.*")
-    with pytest.raises(DataError, match="give a number above 0, or fix"):
+    with pytest.raises(DataError, match="Give a number above 0, or fix"):
         local.with_prior("ball.*", 0.0)
 
 

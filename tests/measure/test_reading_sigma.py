@@ -86,7 +86,9 @@ def test_exact_reading_of_a_redundant_actuator_is_refused():
     robot, data = simulate_positions("cable-4")
     exact = replace(data, reading_sigma=np.array([0.0, 1e-3, 1e-3, 1e-3]))
     with pytest.raises(
-        DataError, match="readings of redundant actuators cannot be exact: state a sigma above 0"
+        DataError,
+        match=r"readings of redundant actuators cannot be exact. Give each a "
+        r"sigma above 0",
     ) as error:
         identify(robot, exact, LeastSquares())
     assert "contradict" not in str(error.value)

@@ -365,7 +365,7 @@ def test_study_of_another_hexapod_has_its_tables_figures_and_claims(tmp_path) ->
         "poses_improve", "positions_improve", "leg_by_leg", "fewest_poses",
     }  # fmt: skip
     text = write_page(shown, MADE_BY)
-    assert "Published beside computed" not in text
+    assert "Published and computed" not in text
     assert all(verdict.reason in text for verdict in shown.content.verdicts)
 
 

@@ -318,7 +318,7 @@ def test_exchange_that_stays_singular_is_refused():
 
 
 def test_criterion_e_is_refused():
-    with pytest.raises(EstimationError, match="choose D, I or A"):
+    with pytest.raises(EstimationError, match="Choose D, I or A"):
         choose_design(make_problem(draw_rows(), Criterion("E")), 5)
 
 

@@ -345,7 +345,7 @@ def test_option_that_is_not_allowed_is_refused_before_anything_is_drawn(options,
 
 
 def test_number_of_poses_and_goal_exclude_each_other():
-    with pytest.raises(DataError, match="give one of them"):
+    with pytest.raises(DataError, match="Give one of them"):
         PlanOptions(n_poses=8, goal=1e-5)
 
 
@@ -426,7 +426,7 @@ def test_low_efficiency_is_reported_as_a_weak_certificate(planned):
 
 def test_instrument_with_stated_rows_is_refused():
     sensor = lc.Sensor(lc.Pose(), lc.Gaussian(np.full(6, UM)), rows=np.arange(3))
-    with pytest.raises(DataError, match="leave out the rows"):
+    with pytest.raises(DataError, match="Leave out the rows"):
         lc.plan(load_robot("hexapod-42"), lc.Instrument((sensor,)))
 
 

@@ -118,7 +118,7 @@ def test_complete_table_of_parameters_has_the_terms_of_the_gum():
     table = build_parameter_table("Parameters", rows, is_complete=True)
     headings = [column.heading for column in table.columns]
     assert headings[3:] == [
-        "shift [tolerances]",
+        "shift [expected spreads]",
         "u",
         "degrees of freedom",
         "k",

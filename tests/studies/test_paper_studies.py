@@ -288,7 +288,7 @@ methods:
         ("method: least-squares", "rows: raw, epsilon: 1, stop: dQint", 9, "per-leg with epsilon"),
         ("method: least-squares", "method: per-leg, steps: 0", 9, "must be from 1 to"),
         ("method: least-squares", "method: per-leg, loss: huber", 9, "has no loss"),
-        ("method: least-squares", "method: per-leg, rows: raw", 9, "remove 'rows'"),
+        ("method: least-squares", "method: per-leg, rows: raw", 9, "Remove 'rows'"),
         ("method: least-squares", "method: map, rows: products", 9, "choice: plane-line"),
         ("method: least-squares", "method: map, rows: rough", 9, "rows"),
         ("[12]", "{p: {count: 40, choice: plane-line}}", 7, "kinds: [plane, line]"),

@@ -107,6 +107,6 @@ def test_export_without_a_file_prints_what_to_type(root, tmp_path, capsys) -> No
     assert document["text"].startswith("[printer]\ndelta_radius: 105.644\n[stepper_a]\n")
     assert "SAVE_CONFIG" in document["notes"][0]
     assert main(["export", run]) == 1
-    assert "state the file to write with -o" in capsys.readouterr().err
+    assert "name the file to write with -o" in capsys.readouterr().err
     assert main(["export", run, "--format", "klipper", "--into", files[0]]) == 1
-    assert "--into is not possible" in capsys.readouterr().err
+    assert "--into is impossible" in capsys.readouterr().err

@@ -139,7 +139,7 @@ def test_compensation_holds_todays_temperatures() -> None:
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [
-        ("temperature", "heat", "call it temperature"),
+        ("temperature", "heat", "Call it temperature"),
         ("condition: time", "condition: tim", "did you mean 'time'"),
         ("condition: time, ", "", "is in no coupling"),
     ],

@@ -113,7 +113,7 @@ def test_redundant_actuators_have_a_margin_but_no_closure_sign():
     "given", [{}, {"readings": np.zeros((2, 6)), "coordinates": np.zeros((2, 6))}]
 )
 def test_path_with_both_or_neither_of_readings_and_coordinates_is_refused(given):
-    with pytest.raises(DataError, match="not both or neither"):
+    with pytest.raises(DataError, match="exactly one of readings and coordinates"):
         trace_singularity(zoo.hexapod(), **given)
 
 

@@ -144,7 +144,7 @@ def test_complete_model_spans_the_sensitivities_of_the_ideal_model() -> None:
         (replace(ROD, base=ROD.base[:5]), "5 base and 6 platform centers"),
         (
             replace(ROD, tolerances=replace(ROD.tolerances, base=LengthTolerance())),
-            "state either sd or limits",
+            "give exactly one of sd and limits",
         ),
     ],
 )

@@ -263,7 +263,7 @@ def test_null_vector_of_the_ru_pus_prs_without_torsion_rotates_two_balls() -> No
 
 
 def test_ideal_model_refuses_spherical_joints_of_axes() -> None:
-    with pytest.raises(MechanismError, match="state error_model: complete"):
+    with pytest.raises(MechanismError, match="Give error_model: complete"):
         replace(THREE_PRS, spherical="axes").expand()
 
 

@@ -138,7 +138,7 @@ def test_urdf_of_another_machine_is_refused(tmp_path, files, read) -> None:
     (tmp_path / "other.urdf").write_text(
         files[FIVE_BAR].read_text().replace('xyz="0.1000', 'xyz="0.2000')
     )
-    with pytest.raises(FileError, match="export into the file it was read from"):
+    with pytest.raises(FileError, match="Export into the file it was read from"):
         export_robot(ExportSource(read[FIVE_BAR][1]), urdf.FORMAT, tmp_path / "other.urdf")
 
 
