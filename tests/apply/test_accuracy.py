@@ -187,7 +187,7 @@ def test_unknown_frame_option_is_refused(fit):
     ):
         pose_uncertainty(fit, TEST_POSES, "world")  # pyright: ignore[reportArgumentType]
     names = "but must be one of 'fitted', 'base', 'relative', 'frame'"
-    with pytest.raises(EstimationError, match=f"frame is 'world'.*; {names}"):
+    with pytest.raises(EstimationError, match=f"frame is 'world', {names}"):
         pose_uncertainty(fit, TEST_POSES, frame="world")
 
 

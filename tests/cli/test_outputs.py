@@ -164,7 +164,7 @@ def test_import_with_a_failed_calibration_changes_no_file(loopcal) -> None:
 
 def test_template_of_a_kind_that_compares_poses_explains_their_names(loopcal) -> None:
     loopcal("new gough -o a.yaml --measurements m.csv --kind separation")
-    assert "Name them in the column pose as a;b and leave its" in Path("m.csv").read_text()
+    assert "name them in the column pose as a;b and leave its" in Path("m.csv").read_text()
     loopcal("new gough -o b.yaml --measurements n.csv --kind position")
     assert "compares two poses" not in Path("n.csv").read_text()
 
