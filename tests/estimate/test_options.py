@@ -100,7 +100,7 @@ def test_method_and_loss_override_the_options() -> None:
     assert fit.options.loss == Huber()
     assert fit.options.noise == "estimated"
     assert options.method == MAP()
-    with pytest.raises(DataError, match="give FitOptions"):
+    with pytest.raises(DataError, match="Give FitOptions"):
         identify(hexapod(), data, options={"noise": "given"})  # pyright: ignore[reportArgumentType]
 
 

@@ -85,7 +85,7 @@ def test_lambda_by_pattern_is_that_of_the_most_exact_pattern_and_zero_without_on
         Ridge({**lam, "leg3.*": 1.0}).resolve(names)
     with pytest.raises(EstimationError, match="a finite number >= 0"):
         Ridge({**lam, "*": -1.0})
-    with pytest.raises(EstimationError, match=r"call resolve\(names\)"):
+    with pytest.raises(EstimationError, match=r"Call resolve\(names\)"):
         Ridge(lam).required_equations(4)
 
 

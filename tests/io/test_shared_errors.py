@@ -148,13 +148,13 @@ def test_components_without_a_line_have_no_bias_and_files_are_written_as_read(tm
 @pytest.mark.parametrize(
     ("line", "words"),
     [
-        ("session_bias: yes", "write 'session_bias: unknown'"),
-        ("session_bias: {}", "write 'session_bias: unknown'"),
+        ("session_bias: yes", "Write 'session_bias: unknown'"),
+        ("session_bias: {}", "Write 'session_bias: unknown'"),
         ("session_bias: {w: 1 um}", "'w'"),
         ("session_bias: {x: 5}", "unit"),
         ("session_bias: {x: 5 deg}", "deg"),
         ("session_drift: {x: 0 um}", "positive number"),
-        ("session_drift: [x]", "write 'session_drift: unknown'"),
+        ("session_drift: [x]", "Write 'session_drift: unknown'"),
     ],
 )
 def test_wrong_lines_are_refused_at_their_place(tmp_path, line, words):

@@ -28,9 +28,9 @@ def simulate_positions(name, n=20, sigma=None):
 
 @pytest.mark.parametrize("given", ["5 um", 1j, np.array([1j]), [[1.0], "a"]])
 def test_sigma_that_is_not_a_number_is_refused(given):
-    with pytest.raises(DataError, match="give numbers, in meters and radians"):
+    with pytest.raises(DataError, match="Give numbers, in meters and radians"):
         Measurements("r", [[0.0, 0.0]], (), reading_sigma=given)  # type: ignore[arg-type]
-    with pytest.raises(DataError, match="give numbers, in meters and radians"):
+    with pytest.raises(DataError, match="Give numbers, in meters and radians"):
         simulate_positions("linear-delta", 1, given)
 
 
@@ -55,9 +55,9 @@ def test_missing_reading_needs_an_infinite_sigma():
         (
             "linear-delta",
             1e12,
-            r"the sigma 1e\+15 mm of the reading of slide1 in row 1 is larger than .* give inf",
+            r"the sigma 1e\+15 mm of the reading of slide1 in row 1 is larger than .* Give inf",
         ),
-        ("linear-delta", 1e200, "give inf"),
+        ("linear-delta", 1e200, "Give inf"),
         ("rotary-delta", 2e6, "in row 1 is larger than any possible error of a reading"),
         (
             "linear-delta",

@@ -286,7 +286,7 @@ def test_kind_without_a_tool_is_refused_and_keeps_the_first_tool(kind):
     if kind.has_tool:
         assert kind.with_tool(T_PLATFORM_TOOL) is kind
         return
-    with pytest.raises(DataError, match=r"use kind\.with_tool\(robot\.tool\)"):
+    with pytest.raises(DataError, match=r"[Uu]se kind\.with_tool\(robot\.tool\)"):
         Observations(
             kind, np.array([0]), np.zeros((1, len(kind.columns))), np.eye(len(kind.noise_columns))
         )

@@ -129,10 +129,10 @@ def test_complete_model_spans_the_sensitivities_of_the_ideal_model() -> None:
 @pytest.mark.parametrize(
     ("record", "sentence"),
     [
-        (replace(ROD, error_model="complete"), "legs: rod with error_model.*state legs: ups"),
-        (replace(ROD, spherical="axes"), "legs: rod with spherical: axes.*state legs: ups"),
-        (replace(ROD, screw=Screw()), "legs: rod with a screw.*state legs: ups"),
-        (replace(CHAIN, spherical="axes"), "spherical: axes.*state error_model: complete"),
+        (replace(ROD, error_model="complete"), "legs: rod with error_model.*Give legs: ups"),
+        (replace(ROD, spherical="axes"), "legs: rod with spherical: axes.*Give legs: ups"),
+        (replace(ROD, screw=Screw()), "legs: rod with a screw.*Give legs: ups"),
+        (replace(CHAIN, spherical="axes"), "spherical: axes.*Give error_model: complete"),
         (
             replace(CHAIN, screw=Screw(0.004, ((0, 0, 1),) * 5, ((1, 0, 0),) * 6)),
             "names 5 base_axes and 6 platform_axes",

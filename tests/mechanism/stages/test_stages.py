@@ -483,7 +483,7 @@ IMPOSSIBLE_CHAINS = {
         ARM.replace("name: shoulder", "name: shoulder\n    on: elbow").replace(
             "name: elbow", "name: elbow\n    on: base"
         ),
-        "list 'elbow' first",
+        "List 'elbow' first",
     ),
     "no actuators": (ARM + PIN, ":12: .*stage 'link' has no actuators"),
     "no stages": ("controlled: [x]\n", "there are no stages"),
