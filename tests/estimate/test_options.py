@@ -105,13 +105,13 @@ def test_method_and_loss_override_the_options() -> None:
 
 
 def test_wrong_argument_type_is_refused_with_the_expected_type() -> None:
-    with pytest.raises(DataError, match=r"robot: got the text 'hexapod-42'; .*load_robot"):
+    with pytest.raises(DataError, match=r"robot: got the text 'hexapod-42'\. .*load_robot"):
         identify("hexapod-42", hexapod_data())  # pyright: ignore[reportArgumentType]
-    with pytest.raises(DataError, match=r"data: got the text 'a.csv'; .*load_measurements"):
+    with pytest.raises(DataError, match=r"data: got the text 'a.csv'\. .*load_measurements"):
         identify(hexapod(), "a.csv")  # pyright: ignore[reportArgumentType]
-    with pytest.raises(DataError, match=r"trials: got a Measurements; .*simulate_trials"):
+    with pytest.raises(DataError, match=r"trials: got a Measurements\. .*simulate_trials"):
         identify_trials(hexapod(), hexapod_data())  # pyright: ignore[reportArgumentType]
-    with pytest.raises(DataError, match=r"prior: got the text 'run'; .*prior_from"):
+    with pytest.raises(DataError, match=r"prior: got the text 'run'\. .*prior_from"):
         FitOptions(prior="run")  # pyright: ignore[reportArgumentType]
     with pytest.raises(DataError, match=r"sequence of labels, such as \['12'\]"):
         FitOptions(excluded_poses="12")

@@ -23,7 +23,7 @@ MM = 1e-3
 
 def test_data_and_robots_that_do_not_fit_are_refused():
     robot = zoo.delta()
-    with pytest.raises(EstimationError, match=r"3 actuators; .* needs six legs") as refused:
+    with pytest.raises(EstimationError, match=r"3 actuators, .* needs six legs") as refused:
         identify_per_leg(robot, simulate_heights(robot, bed_points(8)))
     assert refused.value.code == "fit.no-six-legs"
     precise, poses = tracker(1e-6, 1e-6), hexapod_poses(7)
