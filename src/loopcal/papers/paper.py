@@ -254,7 +254,9 @@ PAPERS: Mapping[str, Paper] = {
             "cmm-constraint-2011",
             "A hexapod calibrated from points on planes and perpendicular lines, held by a "
             "coordinate measuring machine",
-            "International Journal of Advanced Robotic Systems 2011, doi:10.5772/45684",
+            "Yu, Li, Chen: Kinematic Calibration of Parallel Robots for Docking Mechanism Motion "
+            "Simulation, International Journal of Advanced Robotic Systems 2011, "
+            "doi:10.5772/45684",
             ("hexapod-nategh-agheli",),
         ),
     )
