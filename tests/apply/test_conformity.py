@@ -256,7 +256,10 @@ def test_validation_states_conformity_on_the_page_and_in_the_result(held_out) ->
     result = validate(*held_out, limit_position=0.2e-3)
     text = str(view_validation(result, True, False))
     assert "Largest position error of 10, without the noise of the measurement: 0.0" in text
-    assert " against the limit 0.2 mm: conforms with more than 99.9 % probability" in text
+    assert (
+        " against the limit 0.2 mm: conforms. The probability of being within the limit is more "
+        in text
+    )
     stored = json.loads(to_json(result.to_dict()))["conformity"]["position"]
     assert stored["decision"] == "conforms"
     assert stored["acceptance_limit"] < stored["limit"] == 0.2e-3

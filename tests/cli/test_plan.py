@@ -165,7 +165,7 @@ def test_data_file_with_a_surface_per_group_cannot_state_the_instrument(loopcal,
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        ("--poses 2 --kind component --components z", "plan at least 9 poses"),
+        ("--poses 2 --kind component --components z", "Plan at least 9 poses"),
         ("--poses 10 --accuracy 20um", "--poses and --accuracy exclude each other"),
         ("--accuracy 20", "unit"),
         ("--accuracy 1nm --kind position --candidates 30", "out of reach"),
@@ -180,7 +180,7 @@ def test_data_file_with_a_surface_per_group_cannot_state_the_instrument(loopcal,
             for option in NO_PLANE_LINE
         ),
         ("--measure plane-line --hold-out 0", "plane-line, where every point is fitted"),
-        ("--measure plane-line --points 3", "it must be at least 4"),
+        ("--measure plane-line --points 3", "must be at least 4"),
         ("--min-margin 2", "share of the median"),
         ("--max-tilt -3deg", "angle above 0"),
         ("--seen-from 1m,2m", "Give three numbers"),

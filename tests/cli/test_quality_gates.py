@@ -90,5 +90,5 @@ def test_unreachable_poses_fail_the_quality_gate_without_a_user_error(
     assert result["passed"] is False
     (failure,) = [f for f in result["findings"] if f["severity"] == "failure"]
     assert failure["code"] == "gates.poses-unreachable"
-    assert "No pose of hexapod-42 is reached" in failure["data"]["reason"]
+    assert "The two geometries of hexapod-42 reach different poses" in failure["data"]["reason"]
     assert result["reasons"] == [failure["text"]]

@@ -270,7 +270,7 @@ def test_replay_says_where_the_method_of_the_trial_is_not_that_of_the_calibratio
     file = write_study(tmp_path, 2, 2, PER_LEG.replace("{robot}", "hexapod-42")).name
     loopcal(f"run {file} -o f {ONE}")
     _, out, err = loopcal("replay f 0/1 -o trial", code=(0, 2))
-    assert "fitted by per-leg, a published method" in " ".join((out + err).split())
+    assert "used per-leg, a published method" in " ".join((out + err).split())
 
 
 def test_joined_folders_of_two_studies_are_both_named(loopcal, tmp_path) -> None:

@@ -334,7 +334,9 @@ def test_plan_without_tolerances_refuses_unbounded_errors_in_the_base_frame():
     entries = tuple(replace(p, tolerance=None) for p in robot.parameters.entries)
     bare = replace(robot, parameters=replace(robot.parameters, entries=entries))
     options = PlanOptions(n_poses=40, hold_out=0, n_candidates=60, frame="base")
-    with pytest.raises(EstimationError, match="does not determine the base frame, and 42"):
+    with pytest.raises(
+        EstimationError, match="base frame is unidentifiable with this instrument, and 42"
+    ):
         plan(bare, instrument("pose", unknown=("frame",)), options=options)
     for frame in ("fitted", "relative"):
         result = plan(

@@ -68,7 +68,7 @@ def test_students_errors_are_reported_with_what_to_do():
         for finding in result.findings:
             assert finding.code == CODE
             assert (finding.severity is Severity.WARNING) == (result.p_value < 1e-3)
-            assert "use a robust loss" in str(finding)
+            assert "Use a robust loss" in str(finding)
             assert result.median < result.expected
             assert f"{result.largest:.1f}" in str(finding)
 

@@ -220,7 +220,7 @@ def test_mirrored_axes_are_refused_with_the_export(robot, sheet, points, tmp_pat
 def test_swapped_poses_and_targets_are_refused_by_name(robot, sheet, points, tmp_path) -> None:
     names = {f"{a}_{t}": f"{b}_{t}" for a, b in ((4, 9), (9, 4)) for t in TARGETS}
     path = write_spatial_analyzer(tmp_path / "e.txt", rename(points, names))
-    with pytest.raises(DataError, match=r"6 points .* wrong names: 4_SMR1 lies at 9_SMR1; "):
+    with pytest.raises(DataError, match=r"6 points .* wrong names: 4_SMR1 lies at 9_SMR1, "):
         examine(robot, sheet, path)
     swapped = rename(points, {"2_SMR2": "2_SMR3", "2_SMR3": "2_SMR2"})
     path = write_spatial_analyzer(tmp_path / "f.txt", swapped)

@@ -144,7 +144,7 @@ SIX_PUS = {
     "rotation vectors are called Euler angles": Mistake(
         lambda files: files | {DATA: _with_euler_settings(files[DATA])},
         1,
-        ("rotations read as rotation-vector they fit", "Write 'orientation: rotation-vector'"),
+        ("rotations as rotation-vector they fit", "Write 'orientation: rotation-vector'"),
     ),
     "the tracker's frame is not declared unknown": Mistake(
         lambda files: files | {DATA: _in_another_frame(files[DATA])},

@@ -279,7 +279,7 @@ def test_tape_in_another_unit_is_refused(tmp_path, factor) -> None:
     with pytest.raises(FileError) as refused:
         read(tmp_path, samples)
     assert refused.value.code == "files.taped-length-far-off"
-    assert "line A was taped at" in str(refused.value)
+    assert "line A has the taped length" in str(refused.value)
 
 
 def test_estimate_is_that_of_least_squares_updated_with_the_tape(tmp_path) -> None:
