@@ -101,7 +101,7 @@ def test_values_whose_loops_do_not_close_are_refused_together(tmp_path: Path) ->
 
 def test_a_gap_that_could_not_be_computed_is_not_named(tmp_path: Path) -> None:
     """With this radius the first step of the forward solution is not finite."""
-    with pytest.raises(FileError, match="readings of home. The value farthest") as caught:
+    with pytest.raises(FileError, match=r"readings of home. The value farthest") as caught:
         load_robot(
             write_table(tmp_path, "linear-delta", "  - {name: radius, value: 500, unit: mm}")
         )
