@@ -83,7 +83,7 @@ def test_senseless_levels_are_refused(value) -> None:
 def test_senseless_estimates_are_refused() -> None:
     with pytest.raises(EstimationError, match="finite numbers"):
         judge_estimate(float("nan"), 1.0, 1.0)
-    with pytest.raises(EstimationError, match="no error is measured"):
+    with pytest.raises(EstimationError, match="the data contain no error"):
         judge_largest_error(np.full((1, 3), np.nan), np.zeros((1, 3, 3)), 1.0)
 
 
