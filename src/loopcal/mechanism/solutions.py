@@ -495,8 +495,8 @@ def forward(robot: Mechanism, q: ArrayLike, start: Solution | None = None) -> So
     """
     a = len(robot.actuators)
     readings = np.atleast_2d(np.asarray(q, dtype=float))
-    commanded = list_commanded(robot)
-    if readings.ndim == 2 and readings.shape[1] == commanded.sum() < a:
+    is_short = readings.ndim == 2 and readings.shape[1] < a
+    if is_short and readings.shape[1] == (commanded := list_commanded(robot)).sum():
         known, references = readings, [actuator.reference or 0.0 for actuator in robot.actuators]
         readings = np.tile(references, (len(known), 1))
         readings[:, commanded] = known

@@ -625,7 +625,7 @@ def find_reversed(joints: FloatArray, tau: FloatArray, triangles: IntArray) -> B
 
 def count_readings(constants: FloatArray) -> int:
     """Return how many readings the rows have, loads among them."""
-    return int(constants[:, [SOURCE, LOADED]].max(initial=-1.0)) + 1
+    return int(constants[:, SOURCE : LOADED + 1 : 2].max(initial=-1.0)) + 1
 
 
 def split_readings(
@@ -634,11 +634,11 @@ def split_readings(
     """Return the reading, the direction of approach and the load of each row (.., a), 0 where none
     are given.
     """
-    source, load = constants[:, SOURCE].astype(int), constants[:, LOADED].astype(int)
-    a = count_readings(constants)
+    numbers = constants[:, SOURCE : LOADED + 1 : 2].astype(int)
+    a, source = int(numbers.max(initial=-1)) + 1, numbers[:, 0]
     parts = q[..., :a], q[..., a:] if q.shape[-1] == 2 * a else np.zeros_like(q[..., :a])
     if len(source) == a and bool((source == np.arange(a)).all()):
-        return *parts, np.broadcast_to(0.0, parts[0].shape)
+        return *parts, np.zeros_like(parts[0])
     none = np.zeros((*q.shape[:-1], 1))  # what a row with the number -1 reads
     readings, approach = (np.concatenate([part, none], axis=-1) for part in parts)
-    return readings[..., source], approach[..., source], readings[..., load]
+    return readings[..., source], approach[..., source], readings[..., numbers[:, 1]]
