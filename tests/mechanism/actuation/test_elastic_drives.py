@@ -285,7 +285,7 @@ def test_a_force_on_a_stiff_robot_is_refused(tmp_path: Path) -> None:
     [
         ("cable-4", "reads: angle", "reads: angle\n    compliance: 1.0e-4", "does not determine"),
         (NAME, "compliance: 5.0e-5, unknown: [compliance], compliances", "length", "no drive with"),
-        (NAME, "force.y:", "force.q:", "call it temperature"),
+        (NAME, "force.y:", "force.q:", "Call it temperature"),
         (NAME, "[-3000, 1000]", "[3000, 1000]", "first value must be smaller"),
         (NAME, ", compliances: {sd: 1.0e-5}", "", "state `compliances:`"),
         (NAME, "compliance: 5.0e-5", "compliance: -5.0e-5", "negative"),
