@@ -145,7 +145,7 @@ def test_earlier_data_file_states_the_instrument_of_a_plan(loopcal, folder):
     )
     loopcal(
         "plan linear-delta -o other --poses 3 --like before.csv --kind pose",
-        "leave out --kind",
+        "Leave out --kind",
         code=1,
     )
 
@@ -179,7 +179,7 @@ def test_data_file_with_a_surface_per_group_cannot_state_the_instrument(loopcal,
             (f"--measure plane-line {option}", f"{option.split()[0]} cannot be combined with --mea")
             for option in NO_PLANE_LINE
         ),
-        ("--measure plane-line --hold-out 0", "plane-line, where every point is fitted"),
+        ("--measure plane-line --hold-out 0", "plane-line, because it fits every point"),
         ("--measure plane-line --points 3", "must be at least 4"),
         ("--min-margin 2", "share of the median"),
         ("--max-tilt -3deg", "angle above 0"),

@@ -61,7 +61,7 @@ def test_a_named_length_has_no_value_that_no_machine_has(tmp_path: Path, name, v
     path = write_table(tmp_path, "five-bar", row)
     path.write_text(path.read_text().replace("\nidentified:", f"{NAMED}identified:"))
     with pytest.raises(
-        FileError, match=rf"{name} is .*must be greater|'{name}': .* is beyond"
+        FileError, match=rf"{name} is .*must be greater|'{name}': .* exceeds"
     ) as caught:
         load_robot(path)
     assert caught.value.line == len(path.read_text().splitlines())
@@ -78,7 +78,7 @@ def test_a_length_that_is_declared_positive_needs_such_a_value(tmp_path: Path, n
     path = write_table(tmp_path, "five-bar", "  []")
     text = NAMED.replace("length: 75", f"length: {nominal}")
     path.write_text(path.read_text().replace("\nidentified:", f"{text}identified:"))
-    with pytest.raises(LoopcalError, match="parameter 'base' is stated to be positive"):
+    with pytest.raises(LoopcalError, match="parameter 'base' must be positive"):
         load_robot(path)
 
 
@@ -171,7 +171,7 @@ def test_measurements_that_no_instrument_gives_are_refused(line, cell, tmp_path)
     rows = "\n".join(f"p{i},{10 + i},{20 + i},{30 - i},{cell}" for i in range(12))
     header = "pose,q1 [mm],q2 [mm],q3 [mm],z [mm]"
     path.write_text(f"# kind: component\n# components: [z]\n{line}\n{header}\n{rows}\n")
-    with pytest.raises(LoopcalError, match=r"beyond|standard deviation|1e-15|larger than any"):
+    with pytest.raises(LoopcalError, match=r"exceeds|standard deviation|1e-15|larger than any"):
         load_measurements(path, load_robot("linear-delta"))
 
 
