@@ -52,7 +52,7 @@ DELTA = find_robot_file("linear-delta").read_text("utf-8")
         ("readings: {}", "'readings' is"),
         ("readings: [[]]", "'readings' is"),
         ("arms: {rod: 1}", "'arms' is a mapping, but"),
-        ("radius: 1.0e+160", r"'radius'.*1e\+160 mm is beyond"),
+        ("radius: 1.0e+160", r"'radius'.*1e\+160 mm exceeds"),
         ("angles: &a [*a]", "not valid YAML|more than|nest"),
         ('name: "\\ud800"', "name"),
     ],
@@ -90,7 +90,7 @@ def load(folder, settings: dict[str, str], columns: str = "", cells: str = "") -
     [
         ("places", "[[0 mm, 0 mm, 0 mm], [1 mm]]", "lists of equal length"),
         ("places", "[null]", "lists of equal length"),
-        ("places", "[[1e160 m, 0 m, 0 m]]", "beyond 1e\\+09 m"),
+        ("places", "[[1e160 m, 0 m, 0 m]]", "exceeds 1e\\+09 m"),
         ("places", "null", "'places' is empty, but a list is needed"),
         ("kind", "[position]", "is not a kind of measurement"),
         ("kind", "{a: 1}", "is not a kind of measurement"),
