@@ -686,7 +686,9 @@ INSTRUMENT: Any = Group(
 
 UNKNOWN: Any = Group(
     measure=option(
-        "Short for --kind component --components NAMES: some of x,y,z,phi,theta,psi.", type=NAMES
+        "Short for --kind component --components NAMES: some of x,y,z,phi,theta,psi. In loopcal "
+        "plan also plane-line: points on planes with a line.",
+        type=NAMES,
     ),
     unknown_frames=option(
         "Unknown frames: base (the frame of the instrument in the base), tool, or base,tool.",
