@@ -20,10 +20,11 @@ WORDING = ROOT / "tests" / "findings" / "wording.txt"
 
 PLACEHOLDER = re.compile(r"\{(?P<name>\w+)[^{}]*\}")
 SEVERITIES = {
-    Severity.INFO: "worth knowing; nothing to do",
+    Severity.INFO: "worth knowing. The result is usable as it is",
     Severity.SUGGESTION: "a step that would improve the result",
     Severity.WARNING: "the result is usable with care; the text says what to check",
-    Severity.FAILURE: "do not use the result as it is: a quality gate is not met",
+    Severity.FAILURE: "a quality gate is not met (exit code 2). Do not use the result, unless the "
+    "gate is a stated limit: then the values are usable, and the limit is not met",
     Severity.REFUSAL: "the input was refused before anything was computed",
 }
 HEAD = """# Findings

@@ -407,7 +407,7 @@ def _list_results(run: Run) -> Iterator[Content]:
     covariance = _describe_covariance(run.arrays.get("covariance"), parameters)
     yield {"name": "Identified parameters", "data": {"quantity": [*parameters, *covariance]}}
     if volume := content.get("volume"):
-        bound = "upper bound of the position error with 95 % confidence"
+        bound = "upper bound of the position error with a coverage probability of 95 %"
         bounds = [
             _quantity(f"{bound}, {words}", r"\metre", volume[name])
             for name, words in VOLUME_BOUNDS.items()

@@ -185,7 +185,7 @@ def _list_errors(
 ) -> Iterator[tuple[str, str, float | None, float | None, Mapping[str, Any] | None]]:
     """Yield words, quantity, error before and after [SI], and statement on a limit."""
     if volume := record.result.get("volume"):
-        words = "position, upper bound in the working volume (95 % confidence)"
+        words = "position, upper bound in the working volume (coverage probability 95 %)"
         yield words, "position", None, volume["simultaneous"], volume.get("conformity")
     errors = record.result.get("validation") or {}
     poses = name_count(len(record.held_out_labels), "held-out pose")
