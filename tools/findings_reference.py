@@ -23,8 +23,9 @@ SEVERITIES = {
     Severity.INFO: "worth knowing. The result is usable as it is",
     Severity.SUGGESTION: "a step that would improve the result",
     Severity.WARNING: "the result is usable with care; the text says what to check",
-    Severity.FAILURE: "a quality gate is not met (exit code 2). Do not use the result, unless the "
-    "gate is a stated limit: then the values are usable, and the limit is not met",
+    Severity.FAILURE: "a quality gate is not met (exit code 2), or the command failed (exit code "
+    "1). Do not use the result, unless the gate is a stated limit: then the values are usable, and "
+    "the limit is not met",
     Severity.REFUSAL: "the input was refused before anything was computed",
 }
 HEAD = """# Findings
