@@ -153,11 +153,11 @@ def test_page_of_methods_is_true_of_the_evidence(root) -> None:
     narrow = find("ridge", worse, outliers, "covered_position", "mean")
     percents = [f"{100 * share:.0f}" for share in narrow]
     assert narrow[2] < 0.95
-    assert f"its limits contain {percents[0]} % of the errors" in read_page(root, "methods")
+    assert f"U covers {percents[0]} % of the errors" in read_page(root, "methods")
     for method, errors, sentence in (
-        ("default", stated, "Its 95 % limits contain {} % of the errors"),
+        ("default", stated, "U (95 %) covers {} % of the errors"),
         ("default", worse, "and {} % if machines are four times as bad"),
-        ("tolerances as stated", worse, "errors are larger by half and the limits contain {} %"),
+        ("tolerances as stated", worse, "errors are larger by half and U covers {} %"),
     ):
         covered = 100 * find(method, errors, "none", "covered_position", "mean")[0]
         assert sentence.format(f"{covered:.0f}") in read_page(root, "methods")
