@@ -240,7 +240,7 @@ def join_volume(parts: Iterable[tuple[str, Any]]) -> Volume:
 
 @dataclass(frozen=True, eq=False)
 class VolumeAccuracy(Result):
-    """The largest position error in a volume, with a confidence of 95 %.
+    """The largest position error in a volume, with a coverage probability of 95 %.
 
     Attributes
     ----------
