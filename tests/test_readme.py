@@ -40,12 +40,12 @@ def test_examples_of_the_readme_print_what_it_shows_and_improve_the_robot() -> N
     assert np.linalg.norm(result - truth) < 0.5 * np.linalg.norm(names["robot"].values - truth)
 
 
-def test_two_commands_and_a_wheel_are_all_the_set_up(root) -> None:
+def test_an_installation_and_two_commands_are_all_the_set_up(root) -> None:
     project = tomllib.loads((root / "pyproject.toml").read_text("utf-8"))["project"]
-    wheel = re.search(r"^pip install (\w+)-([\w.]+)-py3-none-any\.whl$", README, re.MULTILINE)
-    assert wheel
-    assert wheel[1] == project["name"]
-    assert project["version"].startswith(wheel[2])
+    wheel = f"{project['name']}-{project['version']}-py3-none-any.whl"
+    install = re.search(r"^## Install$.*?^```\n(.*?)^```", README, re.MULTILINE | re.DOTALL)
+    assert install
+    assert install[1] == f"pip install {'.' if 'dev' in project['version'] else wheel}\n"
     block = re.search(r"^## Two commands$.*?^```sh\n(.*?)^```", README, re.MULTILINE | re.DOTALL)
     assert block
     assert [line.split("  ")[0] for line in block[1].splitlines()] == ["make demo", "make test"]

@@ -143,7 +143,7 @@ def test_first_fit_that_does_not_converge_ends_a_comparison():
     assert folds == [0]
     choice = choose_model(hexapod(), hexapod_data(30), options=options)
     assert choice.finding.data["not_compared"] == ("lengths", "ideal")
-    assert "could not test the sets lengths and ideal: with one fold" in str(choice.finding)
+    assert "skipped the sets lengths and ideal. With one fold" in str(choice.finding)
 
 
 def test_parameters_are_not_chosen_by_rows_that_are_far_off():
