@@ -30,7 +30,7 @@ def test_simulated_trials_need_a_value_of_each_parameter(robot, truth):
     "poses", [np.array([0.5, 1.2]), "pose", np.array([True, False]), np.zeros((4, 1), dtype=bool)]
 )
 def test_take_refuses_anything_but_indices_and_a_mask_of_all_poses(data, poses):
-    with pytest.raises(lc.DataError, match="give"):
+    with pytest.raises(lc.DataError, match="Give"):
         data.take(poses)
 
 

@@ -179,7 +179,7 @@ def test_settings_of_every_simple_type_are_written_and_read(registered, tmp_path
         ("flag", "7", "the number 7, but true or false is needed"),
         ("count", "2.5", "the number 2.5, but a whole number is needed"),
         ("steps", "[3]", "'3' has no unit"),
-        ("shown", "left", "left.* allowed: 'near', 'far'"),
+        ("shown", "left", "left.* Allowed: 'near', 'far'"),
     ):
         path.write_text(written.replace(f"{key}: {settings[key][2]}", f"{key}: {wrong}"))
         with pytest.raises(FileError, match=f"'{key}.*{fact}"):

@@ -120,7 +120,7 @@ def test_wrong_held_out_row_is_named_with_its_explanation(
 def test_where_no_other_pose_is_left_no_error_without_them_is_stated():
     values = {"poses": ("1", "2"), "quantity": "length", "error": Quantity(0.2, "mm")}
     finding = report_finding("validation.blunders-dominate", without=None, **values)
-    assert "without them no length error is left. Correct" in str(finding)
+    assert "without them the data contain no length error. Correct" in str(finding)
 
 
 def test_interchanged_poses_are_both_named(fit, split):

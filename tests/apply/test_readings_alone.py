@@ -182,7 +182,7 @@ def test_measurements_are_read_as_saved(robot, tmp_path):
     np.testing.assert_allclose(read.readings, readings, rtol=1e-15)
     assert [rows.kind.name for rows in read.observations] == ["closure"]
     twice = make_data(robot, readings[[0, 1, 1]])
-    with pytest.raises(DataError, match="have the same closure values"):
+    with pytest.raises(DataError, match="have equal closure values"):
         check_duplicates(twice)
 
 

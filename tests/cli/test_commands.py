@@ -200,7 +200,7 @@ def test_choose_model_selects_the_ideal_model(loopcal) -> None:
 
 
 def test_noise_estimated_from_the_residuals_is_reported(loopcal) -> None:
-    loopcal(f"{CALIBRATE} --noise estimated", "noise", "estimated from the residual")
+    loopcal(f"{CALIBRATE} --noise estimated", "residuals determine the noise")
 
 
 def test_heights_alone_cannot_determine_all_parameters(loopcal) -> None:
@@ -299,7 +299,7 @@ def test_simulate_notes_that_a_robot_without_tolerances_has_no_errors_to_draw(
     (tmp_path / "bare.yaml").write_text(bare)
     words = "simulate {} --kind position --draw 5 --draw-errors --truth {}-true.yaml -o {}.csv"
     loopcal(
-        words.format("bare.yaml", "bare", "bare"), "no free parameter of five-bar has a tolerance"
+        words.format("bare.yaml", "bare", "bare"), "no free parameter of five-bar has an expected spread"
     )
     true = lc.load_robot("bare-true.yaml")
     np.testing.assert_array_equal(true.values, true.parameters.nominal)
@@ -443,7 +443,7 @@ def test_simulate_adds_the_requested_noise_to_readings_and_states_it(loopcal, tm
     )
     loopcal(
         "identifiability linear-delta noisy.csv --sigma-reading 5um",
-        "DATA states the noise of its readings",
+        "DATA defines the noise of its readings",
         code=1,
     )
 

@@ -122,7 +122,7 @@ def test_frame_moved_since_the_fit_is_reported_and_kept_for_both_errors(
     write_simulated_data(
         folder / "one.csv", lc.Pose(unknown=("frame",)), 1, 1, unknowns=PLACED | {"frame.x": 0.105}
     )
-    loopcal("validate run moved.csv", "Position error (rms): the same", "Hint: use --refit frame")
+    loopcal("validate run moved.csv", "kept from the fit", "Hint: use --refit frame")
     assert MOVED in read_codes(loopcal("validate run moved.csv --json"))
     loopcal("validate run moved.csv --refit frame", "times smaller after calibration")
     assert MOVED not in read_codes(loopcal("validate run moved.csv --refit frame --json"))

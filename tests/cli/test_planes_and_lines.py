@@ -82,5 +82,5 @@ def test_plan_with_fewer_equations_than_directions_says_so(loopcal):
 
 def test_a_sheet_without_readings_needs_its_plan(loopcal, planned):
     shutil.copy(planned / "plan-cmm" / "measurements.csv", "sheet.csv")
-    message = "this sheet has no readings, and there is no plan.csv beside it"
+    message = "this sheet has no readings, and its folder lacks plan.csv"
     loopcal(f"simulate {ROBOT} --fill sheet.csv -o filled.csv", message, code=1)

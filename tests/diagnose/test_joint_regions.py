@@ -121,5 +121,5 @@ def test_what_the_data_do_not_determine_has_no_region() -> None:
     stopped = identify(
         hexapod(), hexapod_data(20), options=FitOptions(control=lc.StepControl(iterations=0))
     )
-    with pytest.raises(EstimationError, match="no uncertainty"):
+    with pytest.raises(EstimationError, match="no uncertainties"):
         lc.compute_joint_region(stopped)

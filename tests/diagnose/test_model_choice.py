@@ -131,7 +131,7 @@ def test_nuisance_parameters_of_all_rows_are_refused_in_folds():
 def test_first_fit_that_does_not_converge_ends_a_comparison():
     options = FitOptions(method=LeastSquares(), control=StepControl(iterations=1))
     folds = []
-    with pytest.raises(EstimationError, match="without fold 1 of 5 did not converge") as refusal:
+    with pytest.raises(EstimationError, match="leaves out fold 1 of 5 did not converge") as refusal:
         cross_validate(
             hexapod(),
             hexapod_data(30),

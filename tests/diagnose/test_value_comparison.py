@@ -86,7 +86,7 @@ def test_error_of_an_identifiable_robot_is_the_plain_difference():
 )
 def test_truth_with_wrong_shape_or_nan_is_refused(fit, truth, message):
     with pytest.raises(
-        EstimationError, match=f"{message}.*give 42 values for all parameters of 'hexapod'"
+        EstimationError, match=f"{message}.*Give 42 values for all parameters of 'hexapod'"
     ):
         compare_with_truth(fit, truth)
 

@@ -101,7 +101,7 @@ CONTENTS = [
     ("residuals", r"reading left \[deg\]"),
     ("workspace", r"Slices of the workspace"),
     ("workspace", r"less certain than every measured pose"),
-    ("parameters", r"shift \[tolerances\]"),
+    ("parameters", r"shift \[expected spreads\]"),
     ("parameters", r"Correlations of the parameters"),
     ("budget", r"JCGM|type A"),
     ("budget", r"D-K-15123-01"),  # traceability

@@ -278,7 +278,7 @@ def test_every_wrong_value_of_a_result_is_refused_or_harmless(run) -> None:
                 use_everything(dataclasses.replace(intact, result=result))
             else:
                 sentences.append(sentence)
-    assert all("RUN/result.json: " in text and "; " in text for text in sentences)
+    assert all("RUN/result.json: " in text and ". " in text for text in sentences)
     assert len(sentences) > 0.6 * tried > 300
 
 

@@ -229,7 +229,7 @@ def test_readings_outside_the_stroke_and_duplicates_are_refused_by_default(tmp_p
     assert load_measurements(path, robot, allow_outside_stroke=True).n_poses == 2
     digits = "0,0,0,0,0,0,200.0012345"
     path = write(tmp_path, f"{GOOD.replace('0,0,0,0,0,0,200', digits)}c,{digits}\n")
-    with pytest.raises(DataError, match=r"'a' and 'c' \(.*:5 and .*:7\) have the same"):
+    with pytest.raises(DataError, match=r"'a' and 'c' \(.*:5 and .*:7\) have equal"):
         load_measurements(path, robot)
     assert load_measurements(path, robot, allow_duplicates=True).n_poses == 3
 

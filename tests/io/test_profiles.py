@@ -146,7 +146,7 @@ def test_missing_column_is_named_with_the_columns_that_exist(tmp_path, case) -> 
     text = str(refused.value)
     assert text.startswith(f"{tmp_path}/export.txt:2: {tmp_path}/profile.yaml needs the column ")
     assert sentence in text
-    assert "its columns: Name, X [mm], Y [mm]" in text
+    assert "has Name, X [mm], Y [mm]" in text
 
 
 def test_table_of_readings_alone_is_joined_with_measured_values(tmp_path, robot) -> None:

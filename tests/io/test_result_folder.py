@@ -69,7 +69,7 @@ def test_foreign_file_is_never_removed(tmp_path, name, kind) -> None:
     write(tmp_path / "a", kind)
     (tmp_path / "a" / name).parent.mkdir(exist_ok=True)
     (tmp_path / "a" / name).write_text("mine")
-    assert f"also contains {name}, which does not belong to a {kind.content}" in refuse(
+    assert f"also contains {name}, which is foreign to a {kind.content}" in refuse(
         tmp_path / "a", kind
     )
 

@@ -224,7 +224,7 @@ def test_swapped_poses_and_targets_are_refused_by_name(robot, sheet, points, tmp
         examine(robot, sheet, path)
     swapped = rename(points, {"2_SMR2": "2_SMR3", "2_SMR3": "2_SMR2"})
     path = write_spatial_analyzer(tmp_path / "f.txt", swapped)
-    with pytest.raises(DataError, match=r"2 points .*: 2_SMR2 lies at 2_SMR3; 2_SMR3 lies at 2_S"):
+    with pytest.raises(DataError, match=r"2 points .*: 2_SMR2 lies at 2_SMR3, 2_SMR3 lies at 2_S"):
         examine(robot, sheet, path)
 
 

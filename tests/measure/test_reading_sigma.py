@@ -100,4 +100,4 @@ def test_sigmas_of_very_different_size_are_reported():
     assert not any("standard deviations differ" in note for note in map(str, usual.findings))
     extreme = identify(robot, replace(data, reading_sigma=1e-15), LeastSquares())
     note = next(str(f) for f in extreme.findings if "standard deviations differ" in str(f))
-    assert f"that of readings {robot.actuators[0].name}" in note
+    assert f"readings {robot.actuators[0].name}" in note

@@ -123,7 +123,7 @@ THREE_RRR = {
     "a share is given in percent": Mistake(
         keep_files,
         1,
-        ("'--hold-out': it is 25, .* share .* write 0.25 for 25 %",),
+        ("'--hold-out': it is 25, .* share .* Write 0.25 for 25 %",),
         command=CALIBRATE.replace("0.25", "25"),
     ),
     "one reading is missing": Mistake(
@@ -183,7 +183,7 @@ SIX_PUS = {
     "the data belong to another robot": Mistake(
         keep_files,
         1,
-        ("data.csv names the robot '6-pus', but 'hexapod-42' is calibrated",),
+        ("data.csv names the robot '6-pus', but you calibrate 'hexapod-42'",),
         command=CALIBRATE.replace(ROBOT, "hexapod-42"),
     ),
     "one rotation is in radians": Mistake(

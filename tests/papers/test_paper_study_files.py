@@ -136,7 +136,7 @@ def test_cells_of_a_sweep_are_the_batch_of_settings_of_the_reproduction():
             "hexapod-nategh-agheli",
             (
                 "10 poses are drawn from the workspace",
-                "drawn errors with standard deviations of 1 mm in place of those of one machine",
+                "drawn errors with standard deviations of 1 mm in place of one machine",
             ),
             {"method": "per leg"},
         ),

@@ -125,7 +125,7 @@ def test_folder_contains_page_tables_and_figures_and_needs_force(tmp_path) -> No
     write_folder(folder, build_reproduction(), MADE_BY, force=True)
     assert (folder / "figures" / "curve.png").exists()
     (folder / "figures" / "mine.png").touch()
-    with pytest.raises(FileError, match=r"contains figures/mine\.png, which does not belong"):
+    with pytest.raises(FileError, match=r"contains figures/mine\.png, which is foreign"):
         write_folder(folder, build_reproduction(), MADE_BY, force=True)
     assert [p.name for p in folder.parent.iterdir()] == ["out"]
 

@@ -678,7 +678,7 @@ def test_the_study_of_another_robot_is_the_one_that_is_written(tripod_file, tmp_
 
 
 @pytest.mark.parametrize(("old", "new", "message"), [
-    ("tolerances:", "", "no free parameter of .* has a tolerance"),
+    ("tolerances:", "", "no free parameter of .* has an expected spread"),
     ("z: [480, 560]", "z: [4800, 5600]", "almost nothing of its workspace"),
 ])  # fmt: skip
 def test_a_robot_without_errors_or_workspace_is_refused(

@@ -134,7 +134,7 @@ def test_common_errors_have_no_smallest_size(write, tmp_path):
     (tmp_path / "mine.yaml").write_text(f"{text}\ncommon_errors:\n  - {common}\n")
     study = "format: 1\ntitle: t\nrobots: [mine.yaml]\nerrors:\n  e: {distribution: uniform}\n"
     assert load_study(write(study)).errors["e"].distribution == "uniform"
-    with pytest.raises(FileError, match=r"study.yaml:5: .*in common.*remove 'smallest'"):
+    with pytest.raises(FileError, match=r"study.yaml:5: .*in common.*Remove 'smallest'"):
         load_study(write(study.replace("uniform}", "uniform, smallest: 0.5}")))
 
 
@@ -274,7 +274,7 @@ DAMAGES = {
     "quick": ("quick: {replicates: 20", "quick: {replicate: 20", 30, "replicates"),
     "quick title": ("quick: {replicates: 20", "quick: {title: a", 30, "'title'"),
     "quick level": ("noise: 1}", "noise: -1}", 30, "above 0"),
-    "quick list": ("quick: {replicates: 20, noise: 1}", "quick: 20", 30, "must state"),
+    "quick list": ("quick: {replicates: 20, noise: 1}", "quick: 20", 30, "must contain"),
 }  # fmt: skip
 """Damage -> text, what replaces it, line of the error, words of the error."""
 

@@ -389,15 +389,16 @@ class Observations:
 
     def split_noise(self) -> list[tuple[str, StatedSize | None, FloatArray | None]]:
         """Return name, stated size and root (r, m, m) of each part of the noise. Whitened rows
-        times the roots have unit noise in sum; the root is None where one part is all.
+        times the roots have unit noise in sum; the root is None where one part is all. Parts that
+        together exceed the covariance belong to an earlier one, and do not count.
         """
-        if not self.noise_parts:
-            sd = np.sqrt(np.einsum("rii->ri", self.covariance)[self.present])
-            return [("", find_size(sd, {c.dimension for c in self.kind.noise_columns}), None)]
-        parts = list(self.noise_parts)
+        parts, variance = list(self.noise_parts), np.einsum("rii->ri", self.covariance)
         rest = self.covariance - sum(part.covariance for part in parts)
-        variance = np.einsum("rii->ri", self.covariance)[:, :, None]
-        if np.any(np.abs(rest) > ROUNDING * np.where(self.present[:, :, None], variance, np.inf)):
+        least = ROUNDING * np.where(self.present, variance, np.inf)
+        if not parts or np.any(np.einsum("rii->ri", rest) < -least):  # or of another covariance
+            dimensions = {column.dimension for column in self.kind.noise_columns}
+            return [("", find_size(np.sqrt(variance[self.present]), dimensions), None)]
+        if np.any(np.abs(rest) > least[:, :, None]):
             parts.append(NoisePart("", rest))
         if len(parts) == 1:
             return [(parts[0].name, parts[0].size, None)]

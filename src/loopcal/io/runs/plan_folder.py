@@ -111,7 +111,7 @@ def find_plan_sheet(data: Path) -> Path:
     """Return the operator's sheet beside a data file without readings, which has the commands."""
     beside = data.parent / SHEET
     if not beside.is_file():
-        sentence = f"this sheet has no readings, and its folder lacks {SHEET} beside it"
+        sentence = f"this sheet has no readings, and its folder lacks {SHEET}"
         raise FileError(f"{sentence}. Fill in the readings, or name the file in its plan", data)
     return beside
 

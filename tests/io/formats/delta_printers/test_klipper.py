@@ -81,7 +81,7 @@ def test_gap_in_the_records_is_refused_with_its_line(tmp_path, kind, number) -> 
     with pytest.raises(FileError) as refused:
         read(tmp_path, text)
     assert refused.value.code == "files.probe-left-out"
-    assert f"there is no '{kind}{number}'" in str(refused.value)
+    assert f"'{kind}{number}' is missing" in str(refused.value)
     assert refused.value.line is not None
     assert text.splitlines()[refused.value.line - 1].startswith(f"{kind}{number + 1}")
 
