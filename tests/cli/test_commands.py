@@ -299,7 +299,8 @@ def test_simulate_notes_that_a_robot_without_tolerances_has_no_errors_to_draw(
     (tmp_path / "bare.yaml").write_text(bare)
     words = "simulate {} --kind position --draw 5 --draw-errors --truth {}-true.yaml -o {}.csv"
     loopcal(
-        words.format("bare.yaml", "bare", "bare"), "no free parameter of five-bar has an expected spread"
+        words.format("bare.yaml", "bare", "bare"),
+        "no free parameter of five-bar has an expected spread",
     )
     true = lc.load_robot("bare-true.yaml")
     np.testing.assert_array_equal(true.values, true.parameters.nominal)

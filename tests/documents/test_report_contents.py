@@ -82,7 +82,7 @@ CONTENTS = [
     ("verdict", r"Share of each source in the variance"),
     (
         "verdict",
-        r"against the limit 0.06 mm: .*with (?:more than )?[\d.]+ % probability",
+        r"against the limit 0.06 mm: conforms\. .*is (?:more than )?[\d.]+ %",
     ),  # guard-banded
     (
         "budget",

@@ -308,8 +308,7 @@ def test_settings_that_do_not_fit_are_refused_at_their_line(tmp_path, old, new, 
 
 
 @pytest.mark.parametrize(
-    ("robot", "words"),
-    [("tricept", "moves 4 legs"), ("3-prs", "has 3 actuators"), ("6-rus", "")],
+    ("robot", "words"), [("tricept", "moves 4 legs"), ("3-prs", "has 3 actuators"), ("6-rus", "")]
 )
 def test_a_robot_that_per_leg_does_not_fit_is_refused_before_the_study_runs(tmp_path, robot, words):
     path = tmp_path / "study.yaml"

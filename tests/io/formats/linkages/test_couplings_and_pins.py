@@ -257,7 +257,13 @@ THREE = TRANSMISSION.format("j1") + TRANSMISSION.format("j3")
 REFUSED = {
     "two motors": ("RR", {2: (1, 0.5, 0.0)}, "ab", TWO, "'j2' cannot follow 'j1' .* factor 0.5"),
     "no factor": ("RR", {2: (1, 0.0, 0.0)}, "ab", "", "'j2' cannot follow 'j1' .* factor 0"),
-    "unknown leader": ("RR", {2: (7, 1.0, 0.0)}, "ab", "", "'j2' .* 'j7' .* not an independent motion"),
+    "unknown leader": (
+        "RR",
+        {2: (7, 1.0, 0.0)},
+        "ab",
+        "",
+        "'j2' .* 'j7' .* not an independent motion",
+    ),
     "contradiction": ("RRR", {2: (3, 1, 0), 3: (2, 2, 0)}, "abc", "", "'j3' cannot follow 'j2'"),
     "slide elsewhere": ("PRR", {2: (1, 3.0, 0.0)}, "aac", THREE, "'j2' turns with the slide 'j1'"),
 }
