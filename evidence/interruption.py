@@ -268,7 +268,7 @@ class _Server:
         if "Traceback" in said:
             words.append("TRACEBACK")
         if fault.how == INTERRUPT and "stopped before the end" in said:
-            denied = "no result was written" in said
+            denied = "wrote no result" in said
             named = all(
                 (f in re.split(r"\W*(?:\s|$)", said.replace(":", "")) or f in said)
                 == (files == new[f])

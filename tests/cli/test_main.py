@@ -88,7 +88,7 @@ def test_ordinary_calibration_imports_only_what_it_needs(tmp_path) -> None:
     ("error", "sentence"),
     [
         (lc.MechanismError("two\n  lines"), "loopcal: two lines\n"),
-        (KeyboardInterrupt(), "loopcal: stopped before the end, and no result was written.\n"),
+        (KeyboardInterrupt(), "loopcal: stopped before the end, and loopcal wrote no result.\n"),
         (
             PermissionError(13, "Permission denied", "run"),
             "loopcal: run: the operating system refused (permission denied)",

@@ -221,7 +221,7 @@ def _report(
     if outputs:
         names = " and ".join(str(path) for path in outputs)
         terminal.print_message(f"loopcal: written completely before the following: {names}")
-    unwritten = "" if outputs else ", and no result was written"
+    unwritten = "" if outputs else ", and loopcal wrote no result"
     hint = None
     match error:
         case click.exceptions.NoArgsIsHelpError():
