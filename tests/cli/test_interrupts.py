@@ -34,7 +34,8 @@ def _lose_interrupt(*_arguments: object, **_named: object) -> int:
 def test_command_stops_on_an_interrupt_that_a_callback_lost(monkeypatch, capfd) -> None:
     monkeypatch.setattr(entry_point.command_line, "main", _lose_interrupt)
     assert main(["check", "five-bar"]) == 1
-    assert capfd.readouterr().err == "loopcal: stopped before the end, and loopcal wrote no result.\n"
+    sentence = "loopcal: stopped before the end, and loopcal wrote no result.\n"
+    assert capfd.readouterr().err == sentence
 
 
 def test_lost_exceptions_of_other_kinds_are_reported(monkeypatch) -> None:
