@@ -90,7 +90,12 @@ UNITS: dict[str, Unit] = {
         Unit("kNm", Dimension.MOMENT, 1e3),
     )
 }
-SLOPES = {"degC": ("m", "rad"), "s": ("m", "rad"), "N": ("m",), "Nm": ("rad",)}
+SLOPES: dict[str, tuple[str, ...]] = {
+    "degC": ("m", "rad"),
+    "s": ("m", "rad"),
+    "N": ("m",),
+    "Nm": ("rad",),
+}
 """What slopes are per unit of -> the units of these slopes in SI."""
 
 

@@ -149,6 +149,7 @@ def test_halving_the_range_is_a_new_budget_with_half_the_range(case, tmp_path):
     other = lc.load_measurements(path, ROBOT)
     fit = identify(ROBOT, other, options=FitOptions(method=MAP(), sigma_uncertainty=0.0))
     again = compute_error_budget(fit, other, "base")
+    assert again is not None
     (line,) = [x for x in budget.lines if x.source.name == "position, range"]
     assert line.halved.position == pytest.approx(again.position.rms, rel=1e-6)
 
@@ -158,6 +159,7 @@ def test_degrees_of_freedom_of_the_sum_are_those_of_the_guide(case):
     data, *_ = case
     fit = identify(ROBOT, data, options=FitOptions(method=MAP(), noise="estimated"))
     budget = compute_error_budget(fit, data, "base")
+    assert budget is not None
     noise = sum(x.position for x in budget.lines if x.source.kind == "instrument")
     (nu,) = {x.source.degrees for x in budget.lines if x.source.kind == "instrument"}
     expected = nu * (budget.position.rms**2 / noise) ** 2

@@ -352,9 +352,9 @@ def test_decision_is_a_number_line_with_error_interval_and_limit(
     decision = validation.conformity["position"]
     assert axes.get_title().endswith(f"m: {word}")
     factor = {"um": 1e6, "mm": 1e3}[axes.get_xlabel().split("[")[1].rstrip("]")]
-    (error,) = (line.get_xdata()[0] for line in axes.lines if line.get_marker() == "o")
+    (error,) = (np.asarray(line.get_xdata())[0] for line in axes.lines if line.get_marker() == "o")
     assert error == pytest.approx(factor * decision.estimate)
-    assert pytest.approx(factor * limit) in [line.get_xdata()[0] for line in axes.lines]
+    assert pytest.approx(factor * limit) in [np.asarray(line.get_xdata())[0] for line in axes.lines]
     words = [text.get_text() for text in axes.texts]
     assert words == sorted(words, key=["conforms", "undecided", "fails"].index)
     assert axes.get_xlim()[1] > factor * max(decision.high, limit)

@@ -13,6 +13,7 @@ from numpy.testing import assert_allclose
 from loopcal import geometry
 from loopcal.errors import DataError
 from loopcal.measure.kinds import KINDS
+from loopcal.measure.kinds.position import Bearing
 from loopcal.measure.observations import Observations
 from loopcal.units import Dimension
 from tests.jacobians import check_jacobian
@@ -303,6 +304,6 @@ def test_arrays_of_a_kind_are_read_only(kind):
 
 @pytest.mark.parametrize("form", ["theodolite", "camera"])
 def test_bearing_of_a_target_in_the_instrument_has_no_derivative_and_no_warning(form):
-    kind = KINDS["bearing"](places=np.zeros((1, 3)), form=form)
+    kind = Bearing(places=np.zeros((1, 3)), form=form)
     parts = kind.evaluate(np.eye(4)[None, None], np.zeros((1, 2)))
     assert not np.isfinite(parts[1]).all()

@@ -169,7 +169,7 @@ def place_chain(kinds: str, values: dict[int, np.ndarray], path: tuple[int, ...]
             angle = angle + values[i]
         else:
             place = place + values[i] * np.exp(1j * angle)
-    return np.column_stack([place.real, place.imag, np.cos(angle), np.sin(angle)])
+    return np.column_stack([np.real(place), np.imag(place), np.cos(angle), np.sin(angle)])
 
 
 @pytest.mark.parametrize(
