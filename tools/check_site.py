@@ -114,7 +114,7 @@ def search_in_browser(site: Path) -> Iterator[str]:
             except NotFound:
                 yield f"searching for {words}: no result with {expected}"
         page.goto(f"{site.resolve().as_uri()}/index.html")
-        page.wait_for_selector("text=Getting started")
+        page.wait_for_selector("text=Your machine in six steps >> visible=true")
         browser.close()
     yield from (f"the browser asked for {url}" for url in requests if not url.startswith("file:"))
     yield from (f"the browser reports: {error}" for error in errors)
