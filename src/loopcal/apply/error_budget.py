@@ -111,6 +111,13 @@ class Source(NamedTuple):
         return self.kind if words is None else words.format(name=self.name)
 
 
+class NumberedSources(NamedTuple):
+    """The sources of the noise of rows."""
+
+    sizes: dict[tuple[str, str], StatedSize | None]  # by kind and name, in the order of numbers
+    rows: list[RowSources]  # by number, of every kind
+
+
 class CovarianceSplit(NamedTuple):
     """The covariance of the parameters of a fit, by source."""
 
@@ -118,6 +125,7 @@ class CovarianceSplit(NamedTuple):
     roots: tuple[FloatArray, ...]  # (p, k) [SI] for each, whose squares add up to the covariance
     # (p,) parameters of infinite variance, of which the roots contain what the tolerances allow
     undetermined: BoolArray
+    numbered: NumberedSources
 
 
 def split_covariance(linear: FitLinearization) -> CovarianceSplit:
@@ -129,7 +137,8 @@ def split_covariance(linear: FitLinearization) -> CovarianceSplit:
     evaluation = "A and B" if np.isfinite(of_noise) else "B"
     if test.noise == "estimated" or test.failed:
         evaluation = "A"
-    names, members = _number_sources(linear)
+    numbered = _number_sources(linear)
+    names, members = numbered
     noise = float(np.sqrt(linear.sources.noise))
 
     def state(kind: str, name: str, size: StatedSize | None, of: str, nu: float) -> Source:
@@ -168,11 +177,11 @@ def split_covariance(linear: FitLinearization) -> CovarianceSplit:
         key = Source(part.source, name, "A", part.degrees)
         merged.setdefault(key, []).append(part.root / fit.tolerance[:, None])
     roots = tuple(fit.tolerance[:, None] * np.concatenate(each, axis=1) for each in merged.values())
-    return CovarianceSplit(tuple(merged), roots, np.isinf(np.diag(fit.covariance)))
+    return CovarianceSplit(tuple(merged), roots, np.isinf(np.diag(fit.covariance)), numbered)
 
 
 def _halve_sigma(
-    linear: FitLinearization, source: Source
+    linear: FitLinearization, numbered: NumberedSources, source: Source
 ) -> tuple[FloatArray, Linearization, Problem] | None:
     """Return a root (p, k) [SI] of the covariance without added parts if the sigma of a source of
     rows or of the tolerances were half as large, with its linearization; None for other sources.
@@ -181,7 +190,7 @@ def _halve_sigma(
     the residuals gave.
     """
     fit, problem, weight = linear.fit, linear.problem, 1.0
-    nuisance, (of_rows, members) = problem.nuisance, _number_sources(linear)
+    nuisance, (of_rows, members) = problem.nuisance, numbered
     if source.kind == TOLERANCES:
         weight = 4.0
     elif (named := (source.kind, source.name)) in of_rows:
@@ -225,12 +234,8 @@ def _name(rows: Observations, session: str, data: Measurements) -> str:
     return f"{name}, {session}" if session else name
 
 
-def _number_sources(
-    linear: FitLinearization,
-) -> tuple[dict[tuple[str, str], StatedSize | None], list[RowSources]]:
-    """Return the stated size of the sources of rows by kind and name, and those of the rows of
-    every kind by number.
-    """
+def _number_sources(linear: FitLinearization) -> NumberedSources:
+    """Return the sources of the noise of rows."""
     data, problem = linear.data, linear.problem
     numbers: dict[tuple[str, str], int] = {}
     sizes: dict[tuple[str, str], StatedSize | None] = {}
@@ -247,7 +252,7 @@ def _number_sources(
         number = numbers.setdefault((READINGS, ""), len(numbers))
         members.append([(np.full(len(problem.rows[-1].poses), number), None)])
         sizes[READINGS, ""] = _find_drive_size(linear.fit.robot, data.reading_sigma)
-    return sizes, members
+    return NumberedSources(sizes, members)
 
 
 def _find_drive_size(robot: Mechanism, sd: FloatArray | None) -> StatedSize | None:
@@ -546,7 +551,8 @@ def compute_error_budget(
     lines = _list_sources(fit, split, effects, is_relative=frame == RELATIVE)
     sd = np.sqrt(sum(line.parameters for line in lines))
     sd = np.where(split.undetermined, np.inf, sd)
-    halved = [_halve(linear, each, lines, solution, frame, effects) for each in lines]
+    given = lines, solution, frame, effects
+    halved = [_halve(linear, split.numbered, each, *given) for each in lines]
     lines = [replace(line, halved=of_line) for line, of_line in zip(lines, halved, strict=True)]
     position, orientation = _add_kinds(lines)
     n = len(solution.q)
@@ -595,6 +601,7 @@ def _list_sources(
 
 def _halve(
     linear: FitLinearization,
+    numbered: NumberedSources,
     line: SourceBudget,
     lines: list[SourceBudget],
     solution: Solution,
@@ -606,7 +613,7 @@ def _halve(
     position, orientation = (sum(getattr(each, name) for each in lines) for name in LENGTHS)
     parameters = sum(each.parameters for each in lines)
     if line.source.kind in OF_ROWS:
-        halved = _halve_sigma(linear, line.source)
+        halved = _halve_sigma(linear, numbered, line.source)
         if halved is None:
             return None
         root, linearization, problem = halved
