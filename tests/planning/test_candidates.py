@@ -234,6 +234,24 @@ def test_path_that_leaves_the_strokes_is_refused_with_the_reason(hexapod):
     assert not inside.all()
 
 
+@pytest.mark.parametrize("name", ["hexapod-42", "cable-camera", "pulley-3"])
+def test_paths_checked_at_once_are_those_checked_step_by_step(monkeypatch, name):
+    robot = load_robot(name)
+    ranges = np.array([workspace_ranges(robot)[name] for name in robot.controlled])
+    middle, half = ranges.mean(axis=1), np.diff(ranges)[:, 0]
+    rng = np.random.default_rng(4)
+    ends = middle + 1.5 * half * rng.uniform(-1.0, 1.0, (2, 80, len(middle)))
+    # without strokes, so that paths end near singularities and in other modes
+    free = tuple(replace(actuator, stroke=None) for actuator in robot.actuators)
+    robot = replace(robot, assembly=replace(robot.assembly, actuators=free))
+    checker = build_checker(robot, Constraints(min_margin=0.4))
+    at_once = check_paths(checker, *ends).violations.tolist()
+    monkeypatch.setattr(path, "has_one_solution", lambda robot: False)
+    assert at_once == check_paths(checker, *ends).violations.tolist()
+    codes = {None if why is None else why.code for why in at_once}
+    assert codes == {None, "near-singularity", "other-mode"}
+
+
 def test_path_through_a_singularity_is_refused():
     robot = load_robot("five-bar")
     checker = build_checker(robot, Constraints(min_margin=0.0))

@@ -206,6 +206,43 @@ def trace_singularity(
     return replace(result, warnings=tuple(result.list_path_warnings()))
 
 
+def find_near_singularity(
+    robot: Mechanism, state: State, least: tuple[float, float], steps: int
+) -> BoolArray:
+    """Return which rows (n,) of a state (1, n) have a margin or a drive margin below the least.
+
+    Rows are n / steps paths of so many steps each, one after the other. Of each path they are exact
+    up to its first row that is near. A singular value changes at most as much as its matrix (Weyl),
+    so that most rows of a path need no decomposition. For a machine without stages.
+    """
+    *matrices, good = _scale_closure(robot, state)
+    is_near = ~good.reshape(-1, steps)
+    for matrix, bound in zip(matrices, least, strict=True):
+        paths = matrix.reshape(-1, steps, matrix.shape[1] * matrix.shape[2])
+        left, row = np.arange(len(paths)), np.zeros(len(paths), dtype=np.int64)
+        while len(left):
+            known = paths[left, row]
+            singular_values = np.linalg.svd(known.reshape(-1, *matrix.shape[1:]), compute_uv=False)
+            margin = singular_values[:, -1]
+            is_near[left, row] |= ~(margin >= bound)
+            change = np.linalg.norm(paths[left] - known[:, None], axis=2)
+            is_open = ~(margin[:, None] - change > bound * (1.0 + 1e-9))
+            is_open &= np.arange(steps) > row[:, None]
+            going = is_open.any(axis=1) & ~is_near[left, row]
+            left, row = left[going], is_open[going].argmax(axis=1)
+    return is_near.ravel()
+
+
+def compute_margins(robot: Mechanism, state: State) -> tuple[FloatArray, FloatArray]:
+    """Return margin and drive margin (n,) of a state (1, n); NaN where they are not finite."""
+    if robot.stages:
+        margin, _, drive_margin, _ = _compute_chain_margins(robot, state)
+        return margin, drive_margin
+    *matrices, good = _scale_closure(robot, state)
+    values = [np.linalg.svd(matrix, compute_uv=False)[:, -1] for matrix in matrices]
+    return np.where(good, values[0], np.nan), np.where(good, values[1], np.nan)
+
+
 def compute_median_margins(robot: Mechanism) -> tuple[float, float]:
     """Return the median margin and drive margin over the workspace.
 
@@ -216,7 +253,7 @@ def compute_median_margins(robot: Mechanism) -> tuple[float, float]:
         stated.add("phi")
     if set(robot.controlled) <= stated:
         state = sample_workspace(robot, SAMPLE_SIZE).solution.state
-    margin, _, drive_margin, _ = _compute_margins(robot, state)
+    margin, drive_margin = compute_margins(robot, state)
     return float(np.median(margin)), float(np.median(drive_margin))
 
 
@@ -229,6 +266,17 @@ def _compute_margins(
     """
     if robot.stages:
         return _compute_chain_margins(robot, state)
+    A, Q, good = _scale_closure(robot, state)
+    _, s, V = np.linalg.svd(A)
+    _, r, W = np.linalg.svd(Q)
+    margin, drive_margin = (np.where(good, x[:, -1], np.nan) for x in (s, r))
+    return margin, V[:, s.shape[1] - 1], drive_margin, np.abs(W[:, -1]).argmax(axis=1)
+
+
+def _scale_closure(robot: Mechanism, state: State) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Return A (n, c, m) and Q (n, c, a) in meters at a state (1, n) of a machine without stages,
+    zero where a number is not finite, and where all are finite (n,).
+    """
     program = robot.program
     e, _ = robot.slots(robot.values[None])
     blocks = engine.linearize(program, e, driven_values(program, state), state)
@@ -239,11 +287,7 @@ def _compute_margins(
     A = A / robot.twist_scale[list(program.freedoms)]
     Q = Q / np.where(turning[: Q.shape[2]], robot.size, 1.0)
     good = np.asarray(np.isfinite(A).all(axis=(1, 2)) & np.isfinite(Q).all(axis=(1, 2)))
-    A, Q = np.where(good[:, None, None], A, 0.0), np.where(good[:, None, None], Q, 0.0)
-    _, s, V = np.linalg.svd(A)
-    _, r, W = np.linalg.svd(Q)
-    margin, drive_margin = (np.where(good, x[:, -1], np.nan) for x in (s, r))
-    return margin, V[:, s.shape[1] - 1], drive_margin, np.abs(W[:, -1]).argmax(axis=1)
+    return np.where(good[:, None, None], A, 0.0), np.where(good[:, None, None], Q, 0.0), good
 
 
 def _sum_rows(

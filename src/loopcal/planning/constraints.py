@@ -21,7 +21,12 @@ from loopcal.findings import report_finding
 from loopcal.measure.array_checks import check_array
 from loopcal.measure.measurements import Measurements
 from loopcal.mechanism.model import Mechanism
-from loopcal.mechanism.singularities import NEAR_SHARE, analyze_singularity, compute_median_margins
+from loopcal.mechanism.singularities import (
+    NEAR_SHARE,
+    compute_margins,
+    compute_median_margins,
+    find_near_singularity,
+)
 from loopcal.mechanism.solutions import Solution
 from loopcal.mechanism.workspace import evaluate_limits
 from loopcal.typing import BoolArray, FloatArray
@@ -159,19 +164,25 @@ class ConstraintChecker:
     constraints: Constraints
     medians: tuple[float, float]  # of margin and drive margin over the workspace
 
-    def check_poses(self, solution: Solution, at_pose: bool = True) -> ConstraintCheck:
-        """Check poses; `at_pose` False omits the line of sight, which only measuring needs."""
+    def check_poses(
+        self, solution: Solution, at_pose: bool = True, steps: int | None = None
+    ) -> ConstraintCheck:
+        """Check poses; `at_pose` False omits the line of sight, which only measuring needs.
+
+        steps : of paths, whose poses the solution has one after the other; of each path the check
+            is then exact up to its first violation.
+        """
         allowed = np.array(solution.closed)
         violations = np.full(len(allowed), None, dtype=object)
         violations[~allowed] = Violation("loops-open")
-        for violation, violated in self._find_violations(solution, at_pose):
+        for violation, violated in self._find_violations(solution, at_pose, steps):
             first = violated & allowed
             violations[first] = violation
             allowed &= ~violated
         return ConstraintCheck(allowed, violations)
 
     def _find_violations(
-        self, solution: Solution, at_pose: bool
+        self, solution: Solution, at_pose: bool, steps: int | None
     ) -> Iterator[tuple[Violation, BoolArray]]:
         """Yield each violation and the poses (n,) where it occurs."""
         robot, required = self.robot, self.constraints
@@ -184,10 +195,15 @@ class ConstraintChecker:
                 shown = ("needed", str(robot.to_quantity(needed, limit.dimension)))
                 is_near = ~(limit.margin[0] >= needed - slack)
                 yield Violation("near-stroke-end", (name, shown)), is_near
-        near, least = analyze_singularity(robot, solution, self.medians), required.min_margin
         yield Violation("other-mode"), ~solution.converged
-        is_near = ~((near.ratio >= least) & (near.drive_ratio >= least))
-        yield Violation("near-singularity", (("min_margin", least),)), is_near
+        share, (median, drive_median) = required.min_margin, self.medians
+        least = share * median, share * drive_median
+        if steps is None:
+            margin, drive_margin = compute_margins(robot, solution.state)
+            is_near = ~((margin >= least[0]) & (drive_margin >= least[1]))
+        else:
+            is_near = find_near_singularity(robot, solution.state, least, steps)
+        yield Violation("near-singularity", (("min_margin", share),)), is_near
         if required.max_tilt is not None:
             T = solution.T
             tilt = np.arctan2(np.hypot(T[:, 0, 2], T[:, 1, 2]), T[:, 2, 2])

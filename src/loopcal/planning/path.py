@@ -26,7 +26,7 @@ from loopcal.findings import report_finding
 from loopcal.mechanism.chains import has_spare_drives
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import TILT, list_dimensions, read_coordinates
-from loopcal.mechanism.solutions import inverse
+from loopcal.mechanism.solutions import has_one_solution, inverse
 from loopcal.planning.constraints import (
     ConstraintCheck,
     ConstraintChecker,
@@ -40,6 +40,7 @@ from loopcal.units import Dimension
 
 STEPS = 40  # steps in which a path as long as the robot's size, or one radian, is checked
 AT_ONCE = 4096  # paths that are checked at once
+POSES_AT_ONCE = 1 << 14  # poses of them, where a pose does not depend on the one before
 # Difference of readings, in the robot's size or in radians, above which a path ended on another
 # branch than its end.
 BRANCH = 1e-6
@@ -110,6 +111,12 @@ def check_paths(
     for first in range(0, n, AT_ONCE):  # paths of similar length, in the same number of steps
         left = order[first : first + AT_ONCE]
         count = max(int(np.ceil(steps * (float(distance[left].max()) / robot.size))), 4)
+        if has_one_solution(robot):
+            violations[left] = _check_at_once(checker, start[left], end[left], count)
+            # a step in another mode than home may still follow from the step before it
+            left = left[[v is not None and v.code == "other-mode" for v in violations[left]]]
+            if not len(left):
+                continue
         solution = inverse(robot, start[left])
         for i in range(count + 1):
             if i:
@@ -127,6 +134,26 @@ def check_paths(
             violations[left[~(difference <= BRANCH).all(axis=1)]] = Violation("branch-changed")
     allowed = np.array([violation is None for violation in violations], dtype=bool)
     return ConstraintCheck(allowed, violations)
+
+
+def _check_at_once(
+    checker: ConstraintChecker, start: FloatArray, end: FloatArray, count: int
+) -> list[Violation | None]:
+    """Return the first violations of n paths, all of whose steps are solved from home at once, of a
+    machine whose poses have one set of readings each.
+    """
+    share, first = np.arange(count + 1) / count, list[Violation | None]()
+    at_once = max(POSES_AT_ONCE // len(share), 1)
+    for i in range(0, len(start), at_once):
+        begin, goal = (
+            np.repeat(ends[i : i + at_once], len(share), axis=0) for ends in (start, end)
+        )
+        shares = np.tile(share, len(begin) // len(share))
+        solution = inverse(checker.robot, interpolate_path(checker.robot, begin, goal, shares))
+        check = checker.check_poses(solution, at_pose=False, steps=len(share))
+        step = check.allowed.reshape(-1, len(share)).argmin(axis=1)
+        first += check.violations.reshape(-1, len(share))[np.arange(len(step)), step].tolist()
+    return first
 
 
 def _tilt_vector(coordinates: FloatArray, places: list[int]) -> np.ndarray:
