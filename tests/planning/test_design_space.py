@@ -13,6 +13,7 @@ from loopcal.planning.design_space import (
     Criterion,
     PriorInformation,
     Scoring,
+    compute_slopes,
     compute_swap_terms,
     factor_design,
     score_additions,
@@ -167,13 +168,18 @@ def test_derivatives_by_weights_agree_with_finite_differences(criterion, nuisanc
     def score(weights: Array) -> float:
         return scoring.score(scoring.factor(np.sqrt(weights)[:, None, None] * X))
 
+    def differentiate(weights: Array) -> tuple[Array, Array]:
+        R = scoring.factor(np.sqrt(weights)[:, None, None] * X)
+        assert_allclose(compute_slopes(scoring, R, X), differentiate_score(scoring, X, R)[0])
+        return differentiate_score(scoring, X, R)
+
     def slope(weights: Array) -> Array:
-        return differentiate_score(scoring, X, weights)[0]
+        return differentiate(weights)[0]
 
     def difference(function) -> Array:
         return np.array([(function(w + e) - function(w - e)) / (2 * h) for e in h * np.eye(len(w))])
 
-    found, curve = differentiate_score(scoring, X, w)
+    found, curve = differentiate(w)
     assert_allclose(found, difference(score), atol=1e-6)  # h^2
     # h^2 times a third derivative of about 100
     assert_allclose(curve, difference(slope), atol=1e-5)

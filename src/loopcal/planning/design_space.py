@@ -373,6 +373,18 @@ class ScaledCandidates:
         return is_determined(self.factor(chosen))
 
 
+def compute_slopes(scoring: Scoring, R: FloatArray, scaled: FloatArray) -> FloatArray:
+    """Return the derivatives (N,) of the score by weights of groups (N, r, Q), at a nonsingular
+    factor R (Q, Q) of a design.
+    """
+    columns, scale = divide_by_factor(np.eye(len(R)), R)[:, scoring.n_nuisance :], 1.0
+    if scoring.prediction is not None:
+        P = scoring.predict(R)
+        columns, scale = columns @ P.T, float((P**2).sum())
+    Y = scaled.reshape(-1, len(R)) @ columns
+    return np.einsum("mq,mq->m", Y, Y).reshape(scaled.shape[:2]).sum(axis=1) / scale
+
+
 # The change of score by every swap at once.
 
 
@@ -420,25 +432,26 @@ def score_additions(terms: SwapTerms) -> FloatArray:
     return np.log(terms.trace) - np.log(np.maximum(trace, np.finfo(np.float64).tiny))
 
 
-def score_swaps(terms: SwapTerms, j: int) -> FloatArray:
-    """Return the change of score (N,) when each group replaces group j, which is in the design;
-    -inf where the new design is singular.
+def score_swaps(terms: SwapTerms, j: int, among: IntArray | None = None) -> FloatArray:
+    """Return the change of score (N,) when each group, or each of those `among` them, replaces
+    group j, which is in the design; -inf where the new design is singular.
     """
-    Y = terms.Y[j]
-    U = terms.Y @ Y.T
-    WU = terms.W @ U
+    taken = slice(None) if among is None else among
+    Y, W = terms.Y[j], terms.W[taken]
+    U = np.tensordot(terms.Y[taken], Y, (2, 1))
+    WU = W @ U
     S = np.eye(len(Y)) - Y @ Y.T + U.swapaxes(1, 2) @ WU
     sign, logdet = np.linalg.slogdet(S)
     regular = sign > 0.0
     if terms.V is None or terms.gram is None:
-        nuisance = 0.0 if terms.nuisance is None else score_swaps(terms.nuisance, j)
-        return np.where(regular, terms.log_added + logdet - nuisance, -np.inf)
-    V = terms.V[j]
-    cross = WU.swapaxes(1, 2) @ (terms.V @ V.T)
-    product = V @ V.T - cross - cross.swapaxes(1, 2) + WU.swapaxes(1, 2) @ terms.gram @ WU
+        nuisance = 0.0 if terms.nuisance is None else score_swaps(terms.nuisance, j, among)
+        return np.where(regular, terms.log_added[taken] + logdet - nuisance, -np.inf)
+    V, gram = terms.V[j], terms.gram[taken]
+    cross = WU.swapaxes(1, 2) @ np.tensordot(terms.V[taken], V, (2, 1))
+    product = V @ V.T - cross - cross.swapaxes(1, 2) + WU.swapaxes(1, 2) @ gram @ WU
     S = np.where(regular[:, None, None], S, np.eye(len(Y)))
     back = np.trace(np.linalg.solve(S, product), axis1=1, axis2=2)
-    trace = terms.trace - (terms.W * terms.gram).sum(axis=(1, 2)) + back
+    trace = terms.trace - (W * gram).sum(axis=(1, 2)) + back
     return np.where(
         regular & (trace > 0.0),
         np.log(terms.trace) - np.log(np.where(trace > 0.0, trace, 1.0)),

@@ -13,13 +13,14 @@ Kiefer and Wolfowitz. The weights of the candidates that matter maximize a logar
 
     t score(w) + sum log w_i + sum log(c - w_i)   over sum w = n,   t growing,
 
-by Newton's method; other candidates enter while the bound shows that they could help. With
-Y = X R^-1 at the present weights and V = Y P', the second derivatives of the score are
+by Newton's method on the weights and the prices of their limits; other candidates enter while the
+bound shows that they could help. With Y = X R^-1 at the present weights and V = Y P', the second
+derivatives of the score are
 
     D: -|Y_i Y_k'|^2 (minus the part of the nuisance columns)
     I, A: d_i d_k - 2 <Y_i Y_k', V_i V_k'> / |P|^2
 
-At the maximum of the barrier the score is within (number of constraints) / t of the best; Boyd and
+At the maximum of the barrier the score is within (number of limits) / t of the best; Boyd and
 Vandenberghe, Convex Optimization (2004), chapter 11.
 
 Fedorov exchange chooses from a list of candidates. Group after group of the design, in random
@@ -48,6 +49,8 @@ from loopcal.planning.design_space import (
     PriorInformation,
     ScaledCandidates,
     Scoring,
+    SwapTerms,
+    compute_slopes,
     compute_swap_terms,
     divide_by_factor,
     is_allowed,
@@ -59,8 +62,8 @@ from loopcal.typing import FloatArray, IntArray, Progress, report_no_progress
 
 ROUNDS = 40  # largest number of times that candidates enter the barrier problem
 WARM_UP = 12  # multiplicative steps over all candidates that select those to begin with
-NEWTON_STEPS = 40  # largest number of Newton steps for one t
-GROWTH = 20.0  # factor from one t to the next
+NEWTON_STEPS = 100  # largest number of Newton steps
+GROWTH = 10.0  # factor from the t that the prices of the limits belong to, to that of the next step
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,13 +167,9 @@ def _slopes(scoring: Scoring, scaled: FloatArray, w: FloatArray) -> tuple[FloatA
     """Return derivatives d (N,) of the score by the weights, d_0 by a multiple of the prior, and
     the score.
     """
-    R, o, scale = _factor(scoring, scaled, w), scoring.n_nuisance, 1.0
-    Y = divide_by_factor(scaled, R)[:, :, o:]
-    Y0 = divide_by_factor(scoring.prior_rows, R)[:, o:]
-    if scoring.prediction is not None:
-        P = scoring.predict(R)
-        Y, Y0, scale = Y @ P.T, Y0 @ P.T, float((P**2).sum())
-    return (Y**2).sum(axis=(1, 2)) / scale, float((Y0**2).sum()) / scale, scoring.score(R)
+    R = _factor(scoring, scaled, w)
+    d0 = compute_slopes(scoring, R, scoring.prior_rows[None])
+    return compute_slopes(scoring, R, scaled), float(d0[0]), scoring.score(R)
 
 
 def _maximize_weights(
@@ -179,84 +178,86 @@ def _maximize_weights(
     """Return weights (s,) with the same sum, 0 < w < cap, whose score is within `gap` of the best,
     as a share of the efficiency.
 
+    The distances of the weights from their limits have prices, 1 / t of these distances at the
+    maximum of the barrier; Newton's method solves for both (primal-dual interior points).
+
     scaled : (s, r, Q) of a nonsingular set of groups.
     """
-    constraints = len(w) * (2 if np.isfinite(cap) else 1)
-    last = constraints / (gap * scoring.height)
-    t = min(constraints / scoring.height, last)
-    while True:
-        w = _maximize_barrier(scoring, scaled, w, cap, t)
-        if t >= last:
-            return w
-        t = min(GROWTH * t, last)
+    sides = np.array([[1.0], [-1.0]])[: 2 if np.isfinite(cap) else 1]
 
+    def measure_room(w: FloatArray) -> FloatArray:
+        """Return the distances (1 | 2, s) of weights from their limits."""
+        return np.stack([w, cap - w])[: len(sides)]
 
-def _maximize_barrier(
-    scoring: Scoring, scaled: FloatArray, w: FloatArray, cap: float, t: float
-) -> FloatArray:
-    """Return the maximum of the barrier function of one t by Newton's method from w (s,)."""
-
-    def evaluate(w: FloatArray) -> float:
-        walls = np.log(w).sum() + (np.log(cap - w).sum() if np.isfinite(cap) else 0.0)
-        return t * scoring.score(_factor(scoring, scaled, w)) + float(walls)
-
-    def search(w: FloatArray, step: FloatArray, decrement: float) -> FloatArray:
-        """Return the point along a step, inside the limits, where the function has grown by at
-        least a tenth of the predicted gain.
-        """
-        room = np.full(len(w), np.inf)
-        np.divide(-w, step, out=room, where=step < 0.0)
-        np.divide(cap - w, step, out=room, where=step > 0.0)
-        length, before = min(1.0, 0.95 * float(room.min())), evaluate(w)
-        while length > 1e-8:
-            trial = w + length * step
-            if evaluate(trial) >= before + 0.1 * length * decrement:
-                return trial
-            length *= 0.5
-        return w
-
+    R, room = _factor(scoring, scaled, w), measure_room(w)
+    last = room.size / (gap * scoring.height)
+    t = min(room.size / scoring.height, last)
+    price = 1.0 / (t * room)
     for _ in range(NEWTON_STEPS):
-        slope, curvature = differentiate_score(scoring, scaled, w)
-        gradient = t * slope + 1.0 / w - 1.0 / (cap - w)
+        t = min(max(t, GROWTH * room.size / float((price * room).sum())), last)
+        slope, curvature = differentiate_score(scoring, scaled, R)
+        gradient = slope + (sides / room).sum(axis=0) / t
         # In units of each weight's own barrier, so that the system is well scaled however small a
         # weight is.
-        unit = 1.0 / np.sqrt(1.0 / w**2 + 1.0 / (cap - w) ** 2)
-        system = np.eye(len(w)) - t * unit[:, None] * curvature * unit
+        unit = 1.0 / np.sqrt((price / room).sum(axis=0))
+        system = np.eye(len(w)) - unit[:, None] * curvature * unit
         x, y = np.linalg.solve(system, np.stack([unit * gradient, unit], axis=1)).T
         step = unit * (x - y * (unit @ x) / (unit @ y))
-        decrement = float(gradient @ step)
-        if decrement < 1e-2:
-            moved = w + step
-            return moved if (moved > 0.0).all() and (moved < cap).all() else w
-        w = search(w, step, decrement)
+        turn = 1.0 / (t * room) - price - price / room * sides * step
+        gain, length = t * float(gradient @ step), _limit_length(room, sides * step)
+        if t == last and gain < 1e-2:
+            return w + length * step
+        # along the step, until the barrier has grown by at least a tenth of the predicted gain
+        before = t * scoring.score(R) + np.log(room).sum()
+        while True:
+            trial = w + length * step
+            R, room = _factor(scoring, scaled, trial), measure_room(trial)
+            after = t * scoring.score(R) + np.log(room).sum()
+            if after >= before + 0.1 * length * gain:
+                break
+            length *= 0.5
+            if length < 1e-8:
+                return w
+        w, price = trial, price + _limit_length(price, turn) * turn
     return w
 
 
+def _limit_length(values: FloatArray, step: FloatArray) -> float:
+    """Return the part of a step, at most 1, that leaves positive values a twentieth at least."""
+    room = np.full(values.shape, np.inf)
+    np.divide(-values, step, out=room, where=step < 0.0)
+    return min(1.0, 0.95 * float(room.min()))
+
+
 def differentiate_score(
-    scoring: Scoring, scaled: FloatArray, w: FloatArray
+    scoring: Scoring, scaled: FloatArray, R: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return first (s,) and second (s, s) derivatives of the score by the weights."""
-    R, o, s = _factor(scoring, scaled, w), scoring.n_nuisance, len(w)
+    """Return first (s,) and second (s, s) derivatives of the score by the weights of groups
+    (s, r, Q), at the factor R (Q, Q).
+    """
+    o = scoring.n_nuisance
     Y = divide_by_factor(scaled, R)
-
-    def products(Y: FloatArray) -> FloatArray:
-        """Return all products of rows (s r, s r)."""
-        flat = Y.reshape(-1, Y.shape[-1])
-        return flat @ flat.T
-
-    def sum_blocks(products: FloatArray) -> FloatArray:
-        """Return the sums (s, s) over the blocks of products (s r, s r)."""
-        return products.reshape(s, len(products) // s, s, -1).sum(axis=(1, 3))
-
     if scoring.prediction is None:
-        curvature = -sum_blocks(products(Y) ** 2)
+        curvature = -_multiply_pairs(Y, Y)
         if o:
-            curvature += sum_blocks(products(Y[:, :, :o]) ** 2)
+            curvature += _multiply_pairs(Y[:, :, :o], Y[:, :, :o])
         return (Y[:, :, o:] ** 2).sum(axis=(1, 2)), curvature
     P = scoring.predict(R)
     V, trace = Y[:, :, o:] @ P.T, float((P**2).sum())
     slope = (V**2).sum(axis=(1, 2)) / trace
-    return slope, slope[:, None] * slope - 2.0 * sum_blocks(products(Y) * products(V)) / trace
+    return slope, slope[:, None] * slope - 2.0 * _multiply_pairs(Y, V) / trace
+
+
+def _multiply_pairs(Y: FloatArray, V: FloatArray) -> FloatArray:
+    """Return <Y_i Y_k', V_i V_k'> = <Y_i' V_i, Y_k' V_k> (s, s) of rows (s, r, Q) and (s, r, q)."""
+    s, r, q = V.shape
+    if r * r > q:
+        products = (Y.swapaxes(1, 2) @ V).reshape(s, -1)
+        return products @ products.T
+    # row by row of the groups, so that the sum runs over whole matrices (s, s)
+    first, second = (x.swapaxes(0, 1).reshape(r * s, -1) for x in (Y, V))
+    products = (first @ first.T) * (second @ second.T)
+    return products.reshape(r, s, r, s).sum(axis=(0, 2))
 
 
 GAIN = 1e-7  # an exchange or a move must multiply the efficiency by more than 1 + this
@@ -316,22 +317,21 @@ def choose_design(
     ends = [exchange_from_start(candidates, begin, random) for begin in begins]
     chosen, history = max(ends, key=lambda end: end[1][-1])
     _require_determined(history[-1], n, len(usable), scoring.space)
-    steep = np.argsort(-slopes, kind="stable")[: max(AMONG * n, FEWEST)]
-    among = np.union1d(steep, chosen)
     times = max(PERTURBATIONS // n, LEAST_PERTURBATIONS) if perturbations is None else perturbations
-    if relaxed.efficiency(scoring.value(history[-1])) >= GOOD:
-        times = 0
-    best = _perturb(
-        candidates.take(among),
-        np.searchsorted(among, chosen),
-        weights[among],
-        times,
-        random,
-        progress,
-    )
-    chosen, last = _exchange_groups(candidates, among[best], random)
-    value = scoring.value(last[-1])
-    return Design(np.sort(usable[chosen]), value, relaxed, not _is_exhausted(last, n))
+    if times and relaxed.efficiency(scoring.value(history[-1])) < GOOD:
+        steep = np.argsort(-slopes, kind="stable")[: max(AMONG * n, FEWEST)]
+        among = np.union1d(steep, chosen)
+        best = _perturb(
+            candidates.take(among),
+            np.searchsorted(among, chosen),
+            weights[among],
+            times,
+            random,
+            progress,
+        )
+        chosen, history = _exchange_groups(candidates, among[best], random)
+    value = scoring.value(history[-1])
+    return Design(np.sort(usable[chosen]), value, relaxed, not _is_exhausted(history, n))
 
 
 def _require_determined(score: float, n: int, count: int, space: ObservableSpace) -> None:
@@ -361,22 +361,33 @@ def _exchange_groups(
     Returns the groups, and the scores at the beginning and after each exchange.
     """
     scoring, rows = candidates.scoring, candidates.rows
-    chosen, n = chosen.copy(), len(chosen)
+    chosen, n, least = chosen.copy(), len(chosen), GAIN * scoring.height
+
+    def prepare(R: FloatArray) -> tuple[FloatArray, IntArray, SwapTerms]:
+        """Return all slopes, and the groups whose swaps may gain with their terms."""
+        slopes = compute_slopes(scoring, R, rows)
+        listed = np.flatnonzero(slopes >= slopes[chosen].min())
+        return slopes, listed, compute_swap_terms(scoring, R, rows[listed])
+
     R = candidates.factor(chosen)
-    history, terms, idle = [scoring.score(R)], compute_swap_terms(scoring, R, rows), 0
+    history, idle, (slopes, listed, terms) = [scoring.score(R)], 0, prepare(R)
     while idle < n and not _is_exhausted(history, n):
         for j in stream.permutation(n):
-            gain = score_swaps(terms, int(chosen[j]))
-            if not candidates.repeats:
-                gain[chosen] = -np.inf
             idle += 1
-            if gain.max() > GAIN * scoring.height:
+            # The score is concave: a swap gains at most the difference of the slopes.
+            is_useful = slopes[listed] > slopes[chosen[j]] + 0.5 * least
+            if not candidates.repeats:
+                is_useful &= ~np.isin(listed, chosen)
+            useful = np.flatnonzero(is_useful)
+            gain = score_swaps(terms, int(np.searchsorted(listed, chosen[j])), useful)
+            if gain.max(initial=-np.inf) > least:
                 trial = chosen.copy()
-                trial[j] = int(np.argmax(gain))
+                trial[j] = listed[useful[np.argmax(gain)]]
                 R = candidates.factor(trial)
                 score = scoring.score(R)
                 if score > history[-1]:
-                    chosen, terms, idle = trial, compute_swap_terms(scoring, R, rows), 0
+                    chosen, idle = trial, 0
+                    slopes, listed, terms = prepare(R)
                     history.append(score)
             if idle >= n or _is_exhausted(history, n):
                 break

@@ -211,13 +211,16 @@ def find_short_order(cost: FloatArray, from_home: FloatArray) -> tuple[IntArray,
     n = len(cost)
     whole = np.zeros((n + 1, n + 1))
     whole[1:, 1:], whole[0, 1:], whole[1:, 0] = cost, from_home, from_home
+    firsts = np.argsort(from_home, kind="stable")[:FIRST_POSES] + 1
+    tours, nearest = np.zeros((len(firsts), n + 1), dtype=np.int64), firsts
+    left = np.arange(n + 1) > np.zeros((len(firsts), 1))
+    for i in range(1, n + 1):  # to the nearest pose left
+        tours[:, i] = nearest
+        left[np.arange(len(firsts)), nearest] = False
+        nearest = np.where(left, whole[nearest], np.inf).argmin(axis=1)
     best: tuple[IntArray, float, bool] | None = None
-    for first in np.argsort(from_home, kind="stable")[:FIRST_POSES]:
-        tour, left = [0, int(first) + 1], set(range(1, n + 1)) - {int(first) + 1}
-        while left:  # to the nearest pose left
-            tour.append(min(left, key=lambda i: (whole[tour[-1], i], i)))
-            left.remove(tour[-1])
-        tour, is_converged = _reverse_sections(whole, np.array(tour))
+    for begun in tours:
+        tour, is_converged = _reverse_sections(whole, begun)
         length = float(whole[tour[:-1], tour[1:]].sum())
         if best is None or length < best[1] * (1.0 - LEAST_GAIN):
             best = (tour[1:] - 1, length, is_converged)
@@ -229,23 +232,24 @@ def _reverse_sections(cost: FloatArray, tour: IntArray) -> tuple[IntArray, bool]
     """Return the tour after reversing the section that shortens it most, until none does, and
     whether none does. The end is free, the beginning is not.
     """
-    m = len(tour)
+    m, tour = len(tour), tour.copy()
     if m <= 2:
         return tour, True
+    # in the order of the tour; after the last pose there is no step
+    between = np.concatenate([cost[tour][:, tour], np.zeros((m, 1))], axis=1)
+    is_section = np.triu(np.ones((m - 1, m - 1), dtype=bool))
     for _ in range(REVERSALS * m):
-        steps = cost[tour[:-1], tour[1:]]
-        # reversing i..j replaces the steps before i and after j; after the last pose there is none
-        after = np.concatenate([steps[1:], [0.0]])
-        new = cost[tour[:-1, None], tour[None, 1:]]
-        beyond = np.concatenate(
-            [cost[tour[1:, None], tour[None, 2:]], np.zeros((m - 1, 1))], axis=1
-        )
-        gain = steps[:, None] + after[None, :] - new - beyond
-        gain[np.tril_indices(m - 1)] = -np.inf
-        i, j = np.unravel_index(int(np.argmax(gain)), gain.shape)
+        # reversing i..j replaces the steps before i and after j
+        steps = between.diagonal(1)
+        gain = steps[:-1, None] + steps[1:] - between[:-1, 1:-1] - between[1:, 2:]
+        gain = np.where(is_section, gain, -np.inf)
+        i, j = divmod(int(np.argmax(gain)), m - 1)
         if not gain[i, j] > LEAST_GAIN * steps.sum():
             return tour, True
-        tour[i + 1 : j + 2] = tour[i + 1 : j + 2][::-1]
+        section = slice(i + 1, j + 2)
+        tour[section] = tour[section][::-1]
+        between[section] = between[section][::-1]
+        between[:, section] = between[:, section][:, ::-1]
     return tour, False
 
 
