@@ -12,7 +12,6 @@ nuisance parameter is one more row. See docs/theory/identification.md.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -20,6 +19,7 @@ import numpy as np
 from loopcal import engine
 from loopcal.estimate.linearization import KindRows
 from loopcal.estimate.observation_rows import ObservationRows
+from loopcal.frozen_dataclass import dataclass, replace
 from loopcal.measure.initial_values import guess_nuisance_values
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.nuisance import NuisanceParameters

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
 from functools import cached_property
 from numbers import Integral
 from typing import Any, ClassVar
@@ -90,6 +89,7 @@ from loopcal.estimate.unfixed_motions import (
     find_frame_knowledge,
 )
 from loopcal.findings import Finding, report_finding
+from loopcal.frozen_dataclass import dataclass, replace
 from loopcal.measure.array_checks import check_type
 from loopcal.measure.data_checks import check_actuators, check_types
 from loopcal.measure.fitted_rows import FittedRows, collect_fitted_rows

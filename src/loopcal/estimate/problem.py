@@ -24,7 +24,6 @@ exactly the gaps that were recorded (`ConsistentPoses`).
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -56,6 +55,7 @@ from loopcal.estimate.pose_coordinates import (
     TwistCoordinates,
 )
 from loopcal.estimate.pose_rows import BLOCK, PoseBlock, PoseRows, find_components
+from loopcal.frozen_dataclass import dataclass, replace
 from loopcal.measure.kinds.kind import Evaluation, Kind
 from loopcal.measure.measurements import Measurements, anchor_rows
 from loopcal.measure.nuisance import NuisanceParameters
@@ -205,7 +205,7 @@ class Problem:
     readings: FloatArray
     trials: IntArray
     data: Callable[[int], Measurements]
-    control: Halving = Halving()  # noqa: RUF009
+    control: Halving = Halving()
     sigma: FloatArray | None = None
     consistent: ConsistentPoses | None = None
 

@@ -2,13 +2,13 @@
 """An instrument: the kinds it measures, each with its frame and its noise, and random streams."""
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, field, replace
 from typing import Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from loopcal.errors import DataError
+from loopcal.frozen_dataclass import dataclass, field, replace
 from loopcal.measure.array_checks import (
     check_array,
     check_seed,

@@ -11,7 +11,6 @@ docs/theory/kinematics.md.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -19,6 +18,7 @@ from numpy.typing import NDArray
 
 from loopcal import engine, geometry
 from loopcal.engine import BASE, CONVERGED, EXHAUSTED, NOT_FINITE, PITCH, PLATFORM, STALLED, State
+from loopcal.frozen_dataclass import dataclass, replace
 from loopcal.mechanism.actuation import OpenSums, list_open_sums, solve_open_sums
 from loopcal.mechanism.chains import (
     find_carrying_actuators,

@@ -9,7 +9,6 @@ are removed once, by a stated tolerance, for all designs alike. See docs/theory/
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
 
@@ -18,6 +17,7 @@ from numpy.typing import ArrayLike
 
 from loopcal.errors import EstimationError
 from loopcal.findings import report_finding
+from loopcal.frozen_dataclass import dataclass, replace
 from loopcal.numerics.decomposition import RANK_TOLERANCE, are_nonzero
 from loopcal.numerics.elimination import eliminate_from_triangle
 from loopcal.typing import BoolArray, FloatArray, IntArray

@@ -9,7 +9,6 @@ of the setup items that are known.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
 from functools import partial
 from itertools import chain, combinations, permutations
 from typing import Any
@@ -18,6 +17,7 @@ import numpy as np
 
 from loopcal import geometry
 from loopcal.findings import Finding, report_finding
+from loopcal.frozen_dataclass import dataclass, replace
 from loopcal.geometry import OrientationForm, parse_orientation
 from loopcal.measure.kinds.kind import Kind
 from loopcal.measure.kinds.poses import Component, Pose

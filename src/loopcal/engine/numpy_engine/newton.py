@@ -9,7 +9,6 @@ is. Derivation: docs/theory/kinematics.md.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
 from functools import reduce
 from typing import NamedTuple
 
@@ -54,6 +53,7 @@ from loopcal.engine.program import (
     Sums,
     Task,
 )
+from loopcal.frozen_dataclass import dataclass, replace
 from loopcal.typing import BoolArray, FloatArray
 
 # --- Solve closure limb by limb where the platform is given, in closed form.

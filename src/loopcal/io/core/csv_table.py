@@ -15,7 +15,6 @@ import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
@@ -23,6 +22,7 @@ import numpy as np
 
 from loopcal.errors import FileError, UnitError, suggest_names
 from loopcal.findings import Finding, report_finding
+from loopcal.frozen_dataclass import dataclass
 from loopcal.io.core.limits import (
     LINE_LENGTH,
     LONGEST_COMPOSED,
