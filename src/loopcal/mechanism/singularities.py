@@ -207,19 +207,23 @@ def trace_singularity(
 
 
 def find_near_singularity(
-    robot: Mechanism, state: State, least: tuple[float, float], steps: int
+    robot: Mechanism, state: State, least: tuple[float, float], asked: BoolArray, steps: int = 1
 ) -> BoolArray:
-    """Return which rows (n,) of a state (1, n) have a margin or a drive margin below the least.
+    """Return which rows (n,) of a state (1, n) have a margin or a drive margin below the least, or
+    are not asked for.
 
     Rows are n / steps paths of so many steps each, one after the other. Of each path they are exact
     up to its first row that is near. A singular value changes at most as much as its matrix (Weyl),
-    so that most rows of a path need no decomposition. For a machine without stages.
+    so that most rows of a path need no decomposition.
     """
+    if robot.stages:
+        margin, _, drive_margin, _ = _compute_chain_margins(robot, state)
+        return ~((margin >= least[0]) & (drive_margin >= least[1]) & asked)
     *matrices, good = _scale_closure(robot, state)
-    is_near = ~good.reshape(-1, steps)
+    is_near = ~(good & asked).reshape(-1, steps)
     for matrix, bound in zip(matrices, least, strict=True):
         paths = matrix.reshape(-1, steps, matrix.shape[1] * matrix.shape[2])
-        left, row = np.arange(len(paths)), np.zeros(len(paths), dtype=np.int64)
+        left, row = np.flatnonzero(~is_near[:, 0]), np.int64(0)
         while len(left):
             known = paths[left, row]
             singular_values = np.linalg.svd(known.reshape(-1, *matrix.shape[1:]), compute_uv=False)
@@ -227,20 +231,10 @@ def find_near_singularity(
             is_near[left, row] |= ~(margin >= bound)
             change = np.linalg.norm(paths[left] - known[:, None], axis=2)
             is_open = ~(margin[:, None] - change > bound * (1.0 + 1e-9))
-            is_open &= np.arange(steps) > row[:, None]
+            is_open &= np.arange(steps) > np.reshape(row, (-1, 1))
             going = is_open.any(axis=1) & ~is_near[left, row]
             left, row = left[going], is_open[going].argmax(axis=1)
     return is_near.ravel()
-
-
-def compute_margins(robot: Mechanism, state: State) -> tuple[FloatArray, FloatArray]:
-    """Return margin and drive margin (n,) of a state (1, n); NaN where they are not finite."""
-    if robot.stages:
-        margin, _, drive_margin, _ = _compute_chain_margins(robot, state)
-        return margin, drive_margin
-    *matrices, good = _scale_closure(robot, state)
-    values = [np.linalg.svd(matrix, compute_uv=False)[:, -1] for matrix in matrices]
-    return np.where(good, values[0], np.nan), np.where(good, values[1], np.nan)
 
 
 def compute_median_margins(robot: Mechanism) -> tuple[float, float]:
@@ -253,7 +247,7 @@ def compute_median_margins(robot: Mechanism) -> tuple[float, float]:
         stated.add("phi")
     if set(robot.controlled) <= stated:
         state = sample_workspace(robot, SAMPLE_SIZE).solution.state
-    margin, drive_margin = compute_margins(robot, state)
+    margin, _, drive_margin, _ = _compute_margins(robot, state)
     return float(np.median(margin)), float(np.median(drive_margin))
 
 

@@ -23,7 +23,6 @@ from loopcal.measure.measurements import Measurements
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.singularities import (
     NEAR_SHARE,
-    compute_margins,
     compute_median_margins,
     find_near_singularity,
 )
@@ -84,18 +83,19 @@ class LineOfSight(PlanSettings):
                 "Give a smaller and a larger distance, 0 or more"
             )
 
-    def find_violations(
-        self, T: FloatArray, tool: FloatArray
-    ) -> Iterator[tuple[Violation, BoolArray]]:
-        """Yield each violation and the poses T (n, 4, 4) where it occurs; tool: T_platform_tool."""
+    def find_violations(self, T: FloatArray, tool: FloatArray) -> Iterator[tuple[str, BoolArray]]:
+        """Yield the code of each violation and the poses T (n, 4, 4) where it occurs.
+
+        tool : T_platform_tool.
+        """
         to_station = self.station - (T @ tool)[:, :3, 3]
         distance = np.linalg.norm(to_station, axis=1)
         normal = T[:, :3, :3] @ (self.facing / np.linalg.norm(self.facing))
         across = np.linalg.norm(np.cross(normal, to_station), axis=1)
         angle = np.arctan2(across, np.einsum("ni,ni->n", normal, to_station))
         in_range = (distance >= self.nearest) & (distance <= self.farthest)
-        yield Violation("distance-out-of-range"), ~in_range
-        yield Violation("target-faces-away"), ~(angle <= self.cone)
+        yield "distance-out-of-range", ~in_range
+        yield "target-faces-away", ~(angle <= self.cone)
 
 
 @dataclass(frozen=True)
@@ -165,53 +165,44 @@ class ConstraintChecker:
     medians: tuple[float, float]  # of margin and drive margin over the workspace
 
     def check_poses(
-        self, solution: Solution, at_pose: bool = True, steps: int | None = None
+        self, solution: Solution, at_pose: bool = True, steps: int = 1
     ) -> ConstraintCheck:
         """Check poses; `at_pose` False omits the line of sight, which only measuring needs.
 
         steps : of paths, whose poses the solution has one after the other; of each path the check
-            is then exact up to its first violation.
+            is exact up to its first violation.
         """
-        allowed = np.array(solution.closed)
+        robot, required, allowed = self.robot, self.constraints, np.array(solution.closed)
         violations = np.full(len(allowed), None, dtype=object)
-        violations[~allowed] = Violation("loops-open")
-        for violation, violated in self._find_violations(solution, at_pose, steps):
-            first = violated & allowed
-            violations[first] = violation
-            allowed &= ~violated
-        return ConstraintCheck(allowed, violations)
 
-    def _find_violations(
-        self, solution: Solution, at_pose: bool, steps: int | None
-    ) -> Iterator[tuple[Violation, BoolArray]]:
-        """Yield each violation and the poses (n,) where it occurs."""
-        robot, required = self.robot, self.constraints
+        def refuse(violated: BoolArray, code: str, *data: tuple[str, Any]) -> None:
+            """Enter a violation at poses (n,) that have none yet."""
+            violations[violated & allowed] = Violation(code, data)
+            allowed[violated] = False
+
+        violations[~allowed] = Violation("loops-open")
         for limit in evaluate_limits(robot, robot.values[None], solution.q[None], solution.state):
             slack = ROUNDING * max(abs(limit.low), abs(limit.high))
             name = ("limit", limit.name)
-            yield Violation("limit-exceeded", (name,)), ~(limit.margin[0] >= -slack)
+            refuse(~(limit.margin[0] >= -slack), "limit-exceeded", name)
             needed = required.stroke_margin_of(limit.dimension) if limit.is_stroke else 0.0
             if needed > 0.0:
                 shown = ("needed", str(robot.to_quantity(needed, limit.dimension)))
-                is_near = ~(limit.margin[0] >= needed - slack)
-                yield Violation("near-stroke-end", (name, shown)), is_near
-        yield Violation("other-mode"), ~solution.converged
-        share, (median, drive_median) = required.min_margin, self.medians
-        least = share * median, share * drive_median
-        if steps is None:
-            margin, drive_margin = compute_margins(robot, solution.state)
-            is_near = ~((margin >= least[0]) & (drive_margin >= least[1]))
-        else:
-            is_near = find_near_singularity(robot, solution.state, least, steps)
-        yield Violation("near-singularity", (("min_margin", share),)), is_near
+                refuse(~(limit.margin[0] >= needed - slack), "near-stroke-end", name, shown)
+        refuse(~solution.converged, "other-mode")
+        share = required.min_margin
+        least = share * self.medians[0], share * self.medians[1]
+        is_near = find_near_singularity(robot, solution.state, least, allowed, steps)
+        refuse(is_near, "near-singularity", ("min_margin", share))
         if required.max_tilt is not None:
             T = solution.T
             tilt = np.arctan2(np.hypot(T[:, 0, 2], T[:, 1, 2]), T[:, 2, 2])
             largest = ("max_tilt_deg", float(np.degrees(required.max_tilt)))
-            is_tilted = ~(tilt <= required.max_tilt * (1.0 + ROUNDING))
-            yield Violation("tilt-exceeded", (largest,)), is_tilted
+            refuse(~(tilt <= required.max_tilt * (1.0 + ROUNDING)), "tilt-exceeded", largest)
         if at_pose and required.sight is not None:
-            yield from required.sight.find_violations(solution.T, robot.tool)
+            for code, violated in required.sight.find_violations(solution.T, robot.tool):
+                refuse(violated, code)
+        return ConstraintCheck(allowed, violations)
 
 
 def build_checker(robot: Mechanism, constraints: Constraints | None) -> ConstraintChecker:

@@ -364,22 +364,21 @@ def _exchange_groups(
     chosen, n, least = chosen.copy(), len(chosen), GAIN * scoring.height
 
     def prepare(R: FloatArray) -> tuple[FloatArray, IntArray, SwapTerms]:
-        """Return all slopes, and the groups whose swaps may gain with their terms."""
+        """Return all slopes, the groups that may gain, and the terms of the chosen and of these."""
         slopes = compute_slopes(scoring, R, rows)
-        listed = np.flatnonzero(slopes >= slopes[chosen].min())
-        return slopes, listed, compute_swap_terms(scoring, R, rows[listed])
+        may_gain = slopes > slopes[chosen].min()
+        may_gain[chosen] &= candidates.repeats
+        listed = np.flatnonzero(may_gain)
+        return slopes, listed, compute_swap_terms(scoring, R, rows[np.append(chosen, listed)])
 
     R = candidates.factor(chosen)
     history, idle, (slopes, listed, terms) = [scoring.score(R)], 0, prepare(R)
     while idle < n and not _is_exhausted(history, n):
-        for j in stream.permutation(n):
-            idle += 1
+        for j in stream.permutation(n).tolist():
             # The score is concave: a swap gains at most the difference of the slopes.
-            is_useful = slopes[listed] > slopes[chosen[j]] + 0.5 * least
-            if not candidates.repeats:
-                is_useful &= ~np.isin(listed, chosen)
-            useful = np.flatnonzero(is_useful)
-            gain = score_swaps(terms, int(np.searchsorted(listed, chosen[j])), useful)
+            useful = np.flatnonzero(slopes[listed] > slopes[chosen[j]] + 0.5 * least)
+            gain = score_swaps(terms, j, n + useful) if len(useful) else np.zeros(0)
+            idle += 1
             if gain.max(initial=-np.inf) > least:
                 trial = chosen.copy()
                 trial[j] = listed[useful[np.argmax(gain)]]
