@@ -89,10 +89,12 @@ struct Machine {
     int64_t displacements = 0;
     std::vector<size_t> values, rows;  // of each group: joint values, numbers of its rows
 
-    Machine(Random &random, bool free, int freedoms, const GroupShape *shapes) {
-        structure = {GROUPS, 1, freedoms, 0, DRIVES, 0, free, 0, 1, 2, 3, 4, 5};
+    // with `sums`, driven joints are unknown, and as many sums of them are given
+    Machine(Random &random, bool free, int freedoms, const GroupShape *shapes, bool sums = false) {
+        const int64_t driven = sums ? DRIVES : 0, touched = freedoms + sums;
+        structure = {GROUPS, 1, freedoms, 0, DRIVES, 0, free, sums, driven, 0, 1, 2, 3, 4, 5};
         numbers = {0.4};
-        int drive = 0;
+        int64_t drive = 0, unknown = 0;
         for (int g = 0; g < GROUPS; g++) {
             const GroupShape &shape = shapes[g];
             int64_t joints = 0;
@@ -107,11 +109,15 @@ struct Machine {
             if (shape.ending == 2) slots.insert(slots.end(), {joints, 7});
             int64_t count = (int64_t)slots.size() / 2;
             structure.insert(structure.end(), {LIMBS, joints, shape.ending, shape.rows, count,
-                                               (int64_t)solved.size(), displacements, 0, freedoms});
+                                               (int64_t)solved.size(), displacements, 0, touched});
             for (int f = 0; f < freedoms; f++) structure.push_back(f);
+            if (sums) structure.push_back(6 + shape.driven);
             for (int k = 0; k < LIMBS; k++) structure.insert(structure.end(), {-1, 0});
-            for (int k = 0; k < LIMBS; k++)
+            for (int k = 0; k < LIMBS; k++) {
                 for (int f = 0; f < freedoms; f++) structure.push_back(f);
+                if (sums) structure.push_back(freedoms + drive + k);
+            }
+            unknown += LIMBS * (int64_t)solved.size();
             displacements += LIMBS * count;
             for (int i = 0; i < shape.rows; i++) structure.push_back(i);
             for (int64_t j = 0; j < joints; j++) structure.push_back(shape.joints[j] == 'R');
@@ -133,9 +139,18 @@ struct Machine {
             rows.push_back((size_t)(LIMBS * shape.rows * ((int64_t)solved.size() + freedoms + count + joints + 1)));
         }
         structure[3] = displacements;
-        structure.insert(structure.end(), {0, freedoms});  // may_stay_open, twists
+        structure.insert(structure.end(), {0, freedoms + driven});  // may_stay_open, twists
         for (int f = 0; f < freedoms; f++) structure.push_back(f);
+        for (int64_t j = 0; j < driven; j++) structure.push_back(6 + unknown + j);
         structure.insert(structure.end(), {0, 0});
+        if (!sums) return;
+        // driven joints are eliminated first, by all rows, then the platform by those that are left
+        structure.insert(structure.end(), {DRIVES, 2 * DRIVES, DRIVES + freedoms});
+        for (int64_t i = 0; i < 2 * DRIVES; i++) structure.push_back(i);
+        for (int64_t i = 0; i < DRIVES + freedoms; i++) structure.push_back((freedoms + i) % (DRIVES + freedoms));
+        structure.insert(structure.end(), {freedoms, DRIVES, freedoms});
+        for (int64_t i = 0; i < DRIVES; i++) structure.push_back(DRIVES + i);
+        for (int64_t i = 0; i < freedoms; i++) structure.push_back(i);
     }
 };
 
@@ -189,7 +204,8 @@ void add_kinematics(int set, bool free, int freedoms, int64_t t, int64_t n, Dige
     std::vector<int64_t> iterations((size_t)(t * n));
     std::vector<int8_t> status((size_t)(t * n)), sign((size_t)(t * n));
     loopcal::Strided arrays[] = {{e.data(), machine.displacements, 0},
-                                 {q.data(), n * DRIVES, DRIVES}, {T.data(), 0, 0}, {nullptr, 0, 0}};
+                                 {q.data(), n * DRIVES, DRIVES}, {T.data(), 0, 0}, {nullptr, 0, 0},
+                                 {nullptr, 0, 0}, {nullptr, 0, 0}};
     loopcal_solve(set, machine.structure.data(), machine.numbers.data(), arrays, given.data(), t, n,
                   30, nullptr, nullptr, poses.data(), joints_out.data(), residual.data(),
                   iterations.data(), status.data(), sign.data());
@@ -227,6 +243,33 @@ void add_kinematics(int set, bool free, int freedoms, int64_t t, int64_t n, Dige
     digest.add(poses), digest.add(residual), digest.add(iterations);
     digest.add(status), digest.add(sign);
     for (size_t g = 0; g < GROUPS; g++) digest.add(joints[g]), digest.add(rows[g]);
+}
+
+// Poses at sums of driven joints, which other trials weigh otherwise.
+void add_sums(int set, int64_t t, int64_t n, Digest &digest) {
+    Random random;
+    Machine machine(random, false, 6, SHAPES, true);
+    Reals e = random.reals((size_t)(t * machine.displacements), 1e-3), q = random.reals(DRIVES, 0.1), T;
+    Reals weights = random.reals((size_t)(t * DRIVES * DRIVES), 1.0), values = random.reals((size_t)(t * n * DRIVES), 0.1);
+    values[1] = INFINITY;
+    add_rotation(random, T);
+    T = {T[0], T[1], T[2], 0.1, T[3], T[4], T[5], 0.2, T[6], T[7], T[8], 0.4, 0, 0, 0, 1};
+    std::vector<Reals> start, joints;
+    for (size_t value : machine.values) start.push_back(random.reals(value, 0.5)), joints.emplace_back((size_t)(t * n) * value);
+    std::vector<loopcal::Strided> given;
+    std::vector<double *> out;
+    for (const Reals &of_group : start) given.push_back({of_group.data(), 0, 0});
+    for (Reals &of_group : joints) out.push_back(of_group.data());
+    Reals poses((size_t)(16 * t * n)), residual((size_t)(t * n));
+    std::vector<int64_t> iterations((size_t)(t * n));
+    std::vector<int8_t> status((size_t)(t * n)), sign((size_t)(t * n));
+    loopcal::Strided arrays[] = {{e.data(), machine.displacements, 0}, {q.data(), 0, 0}, {T.data(), 0, 0}, {nullptr, 0, 0},
+                                 {weights.data(), DRIVES * DRIVES, 0}, {values.data(), n * DRIVES, DRIVES}};
+    loopcal_solve(set, machine.structure.data(), machine.numbers.data(), arrays, given.data(), t, n,
+                  30, nullptr, nullptr, poses.data(), out.data(), residual.data(),
+                  iterations.data(), status.data(), sign.data());
+    digest.add(poses), digest.add(residual), digest.add(iterations), digest.add(status), digest.add(sign);
+    for (const Reals &of_group : joints) digest.add(of_group);
 }
 
 // Poses of driven rods, of which a part is proven, and a part is solved for.
@@ -301,6 +344,7 @@ int main() {
             for (int64_t n : {1, 3, 21}) add_kinematics(set, free, 6, 13, n, digest);
         add_kinematics(set, false, 6, 1, 50, digest);
         for (const GroupShape *shapes : {SHAPES, RODS}) add_kinematics(set, true, 0, 5, 21, digest, shapes);
+        for (int64_t n : {3, 21}) add_sums(set, 5, n, digest);
         for (bool torsion : {false, true}) add_targets(set, 5, 45, torsion, digest);
         for (int64_t n : {1, 13, 50}) add_comparisons(set, n, digest);
         for (int64_t p : {1, 7, 43}) add_factors(set, 11, 50, p, digest);

@@ -172,9 +172,10 @@ template <class Number, int ENDING> struct Limb {
             shift(axis, out);
     }
 
-    // Column c of the freedoms that the limb touches.
+    // Column c of the unknowns of nodes that the limb touches.
     INLINE void touch(int c, Lanes *out) const {
         int f = (int)group.freedom[c];
+        if (f >= DRIVEN) return joint(f - DRIVEN, out);
         if (c >= group.carried) return freedom(f, out);
         Lanes axis[3] = {}, at[3];
         axis[f % 3] = splat(1.0);

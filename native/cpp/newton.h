@@ -24,6 +24,7 @@ struct NewtonWork {
     Lanes *low;      // columns (freedoms | residual) of the rows without joints
     Lanes *front;    // what an elimination of a node factorizes
     Lanes *twists;   // of all nodes
+    Lanes *drives;   // values of the driven joints
 
     static size_t reduced_of(const Program &program) {
         size_t count = 0;
@@ -35,10 +36,11 @@ struct NewtonWork {
     }
 };
 
-// Conditions on the pose, of each lane: residual (conditions) and slopes (conditions, 6).
-struct TaskRows {
+// What is asked for beside closure, of each lane. Conditions on the pose: residual (conditions) and
+// slopes (conditions, 6). Sums of driven joints: weights (sums, drives) and values (sums).
+struct Demands {
     int conditions;
-    const double *residual[W], *slopes[W];
+    const double *residual[W], *slopes[W], *weights[W], *values[W];
 };
 
 // The largest part of a twist, an angle times the robot's size.
@@ -55,7 +57,7 @@ class Equations {
   public:
     Equations(const Program &program, const NewtonWork &work)
         : program_(program), work_(work), redundant_(program.sigma && !program.free),
-          step_size_(6 * program.nodes + program.unknown_joints()),
+          step_size_(program.step_size()),
           coordinate_size_(12 * program.nodes + program.joint_values()) {}
 
     int step_size() const { return step_size_; }
@@ -63,7 +65,7 @@ class Equations {
 
     static int low_rows(const Program &program, int conditions) {
         if (program.eliminations) return program.closed_rows() + conditions;
-        int count = conditions;
+        int count = conditions + program.sums;
         for (int g = 0; g < program.groups; g++) {
             const Group &group = program.group[g];
             if (group.rows > group.unknown) count += group.limbs * (group.rows - group.unknown);
@@ -74,9 +76,9 @@ class Equations {
     // The Newton step at coordinates and its measures. Where a row `may_stay` (its last step was
     // a rounding error) and it closes, the step is zero, and sign and pivot stay.
     template <class Number>
-    void evaluate(const Number *placed, const Lanes *coordinates, const TaskRows *task,
+    void evaluate(const Number *placed, const Lanes *coordinates, const Demands &demands,
                   Mask may_stay, Mask alive, Lanes *step, Measures &measures) const {
-        int m = program_.twists, conditions = task ? task->conditions : 0;
+        int m = program_.twists, conditions = demands.conditions;
         int rows = low_rows(program_, conditions);
         Lanes inner{}, sign = splat(1.0), pivot = splat(1.0), *reduced = work_.reduced;
         const Lanes *theta = coordinates + 12 * program_.nodes;
@@ -102,13 +104,15 @@ class Equations {
             }
         }
         Lanes *low = work_.low;
+        if (program_.sums) {
+            sum_drives(coordinates + 12 * program_.nodes, demands, rows, low + filled);
+            filled += program_.sums;
+        }
         filled += program_.padding;
-        if (task) {
-            for (int i = 0; i < conditions; i++, filled++) {
-                for (int f = 0; f < program_.freedoms; f++)
-                    low[f * rows + filled] = gather(task->slopes, 6 * i + program_.freedom[f]);
-                low[m * rows + filled] = gather(task->residual, i);
-            }
+        for (int i = 0; i < conditions; i++, filled++) {
+            for (int f = 0; f < program_.freedoms; f++)
+                low[f * rows + filled] = gather(demands.slopes, 6 * i + program_.freedom[f]);
+            low[m * rows + filled] = gather(demands.residual, i);
         }
         for (; filled < rows; filled++)
             for (int f = 0; f <= m; f++) low[f * rows + filled] = Lanes{};
@@ -142,6 +146,7 @@ class Equations {
 
     // Coordinates a fraction of the step beyond.
     void move(const Lanes *from, const Lanes *step, Lanes fraction, Lanes *to) const {
+        const Lanes *driven = step + step_size_ - program_.drives;
         for (int n = 0; n < program_.nodes; n++, from += 12, to += 12, step += 6) {
             Lanes twist[6], turn[9];
             for (int i = 0; i < 6; i++) twist[i] = fraction * step[i];
@@ -156,6 +161,10 @@ class Equations {
                 for (int j = 0; j < group.unknown; j++) {
                     int at = (int)group.solved[j];
                     to[at] = from[at] + fraction * step[j];
+                }
+                for (int j = 0; j <= group.joints && program_.frees_drives; j++) {
+                    int64_t drive = group.actuator[j * group.limbs + k];
+                    if (drive >= 0) to[j] = to[j] + fraction * driven[drive];
                 }
                 from += group.joints + 1, to += group.joints + 1, step += group.unknown;
             }
@@ -217,9 +226,34 @@ class Equations {
         for (int i = u; i < r; i++) {
             Lanes *low = work_.low + filled + i - u, scale = splat(1.0);
             if (redundant_) scale = magnitude(reduced[(u + m) * r + i]);
-            for (int f = 0; f < m; f++)
-                low[touches[f] * rows] = redundant_ ? reduced[(u + f) * r + i] / scale : reduced[(u + f) * r + i];
+            for (int f = 0; f < m; f++) {
+                Lanes entry = reduced[(u + f) * r + i], &to = low[touches[f] * rows];
+                if (redundant_) entry = entry / scale;
+                to = group.freedom[f] < DRIVEN ? entry : to + entry;  // joints may share a drive
+            }
             low[program_.twists * rows] = redundant_ ? column[i] / scale : column[i];
+        }
+    }
+
+    // The rows of the sums of driven joints at joint values theta, the first one at `low`.
+    void sum_drives(const Lanes *theta, const Demands &demands, int rows, Lanes *low) const {
+        Lanes *q = work_.drives;
+        for (int g = 0; g < program_.groups; g++) {
+            const Group &group = program_.group[g];
+            for (int k = 0; k < group.limbs; k++, theta += group.joints + 1)
+                for (int j = 0; j <= group.joints; j++) {
+                    int64_t drive = group.actuator[j * group.limbs + k];
+                    if (drive >= 0) q[drive] = theta[j];
+                }
+        }
+        int drives = program_.drives, first = program_.twists - drives;
+        for (int i = 0; i < program_.sums; i++, low++) {
+            Lanes sum{};
+            for (int j = 0; j < drives; j++) {
+                Lanes weight = low[(first + j) * rows] = gather(demands.weights, i * drives + j);
+                sum = sum + weight * q[j];
+            }
+            low[program_.twists * rows] = sum - gather(demands.values, i);
         }
     }
 
@@ -286,18 +320,24 @@ class Equations {
 
     // The largest part of a step, an angle times the robot's size.
     Lanes measure_step(const Lanes *step) const {
+        const Lanes *driven = step + step_size_ - program_.drives;
         Lanes length = measure_twist(step, program_.size);
         step += 6;
         for (int n = 1; n < program_.nodes; n++, step += 6)
             length = larger(length, measure_twist(step, program_.size));
         for (int g = 0; g < program_.groups; g++) {
             const Group &group = program_.group[g];
-            for (int k = 0; k < group.limbs; k++)
-                for (int j = 0; j < group.unknown; j++, step++) {
-                    int of = (int)group.solved[j];
-                    bool turns = of < group.joints && group.turns[of];
-                    length = larger(length, magnitude(*step) * (turns ? program_.size : 1.0));
+            auto measure = [&](int j, Lanes moved) {
+                bool turns = j < group.joints && group.turns[j];
+                length = larger(length, magnitude(moved) * (turns ? program_.size : 1.0));
+            };
+            for (int k = 0; k < group.limbs; k++) {
+                for (int j = 0; j < group.unknown; j++) measure((int)group.solved[j], *step++);
+                for (int j = 0; j <= group.joints && program_.frees_drives; j++) {
+                    int64_t drive = group.actuator[j * group.limbs + k];
+                    if (drive >= 0) measure(j, driven[drive]);
                 }
+            }
         }
         return length;
     }

@@ -9,6 +9,7 @@ namespace INSTRUCTION_SET {
 
 enum Ending { RIGID = 0, BALL = 1, DISTANCE = 2 };
 constexpr int PITCH = 6, LENGTH = 7;  // values of Slot.axis beside those of a twist
+constexpr int DRIVEN = 6;             // freedom of a limb that is joint 0, if it is driven
 constexpr int LINK = 21;              // numbers of a placed link: rotation, slope, origin
 constexpr int ROD = 2 * LINK + 1;     // numbers of a placed limb that is a rod alone
 
@@ -16,10 +17,11 @@ constexpr int ROD = 2 * LINK + 1;     // numbers of a placed limb that is a rod 
 struct Group {
     int limbs, joints, ending, rows, slots, unknown;
     int64_t first_column;      // of e
-    int carried, touched;      // freedoms of the bodies at which limbs begin, and of both ends
-    const int64_t *freedom;    // `touched` freedoms, those of the first bodies first
+    int carried, touched;      // freedoms of the bodies at which limbs begin; all unknowns of nodes
+    const int64_t *freedom;    // `touched`: freedoms of the first bodies, then of those at which limbs
+                               // end, then DRIVEN + joint of each driven joint whose sums are given
     const int64_t *ends;       // (limbs, 2): the bodies at which they begin and end, -1 for the base
-    const int64_t *touches;    // (limbs, touched): columns of all freedoms
+    const int64_t *touches;    // (limbs, touched): columns of the unknowns of all nodes
     const int64_t *row;        // rows of the ending that count
     const int64_t *turns;      // joints: 1 for R, 0 for P
     const int64_t *solved;     // `unknown` joints that closure determines
@@ -44,19 +46,21 @@ struct Elimination {
 
 struct Program {
     int groups, freedoms, displacements, drives, free;
+    bool frees_drives;         // whether driven joints are unknown, as one more node, and their
+    int sums;                  // sums are given, so many
     int freedom[6];
-    int nodes, twists;         // the platform and other bodies, and the freedoms of all of them
-    const int64_t *place;      // (twists,): their places in the steps of all nodes, six each
+    int nodes, twists;         // the platform and other bodies, and the unknowns of all nodes
+    const int64_t *place;      // (twists,): their places in a step
     int eliminations;          // 0 where the platform is the only node
-    int padding, task_place;   // rows of zeros behind those of closure; where the platform's rows
-                               // of a task come among those that eliminate it
+    int padding, task_place;   // rows of zeros behind those of closure and of sums; where the
+                               // platform's rows of a task come among those that eliminate it
     Elimination *elimination;  // in their order, the platform last
     const double *sigma;  // (drives,), null without redundancy
     double size;
     Group *group;
     bool may_stay_open;  // whether a least-squares solution counts as closed
 
-    // `memory` for as many groups as whole[0] states, `order` for as many nodes as whole[1] does
+    // `memory` for as many groups as whole[0] states, `order` for one node more than whole[1] does
     Program(const int64_t *whole, const double *real, Group *memory, Elimination *order)
         : group(memory) {
         const int64_t *i = whole;
@@ -64,6 +68,7 @@ struct Program {
         freedoms = (int)*i++, displacements = (int)*i++, drives = (int)*i++;
         bool has_sigma = *i++ != 0;
         free = (int)*i++;
+        frees_drives = *i++ != 0, sums = (int)*i++;
         for (int f = 0; f < 6; f++) freedom[f] = (int)*i++;
         size = *real++;
         sigma = has_sigma ? real : nullptr;
@@ -92,7 +97,7 @@ struct Program {
         twists = (int)*i++;
         place = i, i += twists;
         padding = (int)*i++, task_place = (int)*i++;
-        eliminations = nodes > 1 ? nodes : 0;
+        eliminations = nodes > 1 || frees_drives ? nodes + frees_drives : 0;
         elimination = order;
         for (int n = 0; n < eliminations; n++) {
             Elimination &o = order[n];
@@ -127,13 +132,13 @@ struct Program {
         return (int)node.row[i - conditions];
     }
 
-    // Rows of closure without joints, and those of zeros of nodes that have too few.
+    // Rows of closure without joints, of sums, and those of zeros of nodes that have too few.
     int closed_rows() const {
         int count = 0;
         for (int g = 0; g < groups; g++)
             if (group[g].rows > group[g].unknown)
                 count += group[g].limbs * (group[g].rows - group[g].unknown);
-        count += padding;
+        count += sums + padding;
         return eliminations || count > freedoms ? count : freedoms;
     }
 
@@ -148,6 +153,9 @@ struct Program {
         for (int g = 0; g < groups; g++) count += group[g].limbs * group[g].unknown;
         return count;
     }
+
+    // A step: a twist of each node, the unknown joints, and the driven ones if they are unknown.
+    int step_size() const { return 6 * nodes + unknown_joints() + (frees_drives ? drives : 0); }
 };
 
 // Eliminate the nodes of a matrix of `rows` and of the columns of all twists and `sides` right sides;
@@ -183,10 +191,10 @@ inline Lanes eliminate_nodes(const Program &program, Lanes *matrix, int rows, in
 class ProgramMemory {
   public:
     explicit ProgramMemory(const int64_t *structure)
-        : arena_(Arena::need<Group>((size_t)structure[0]) + Arena::need<Elimination>((size_t)structure[1])) {
+        : arena_(Arena::need<Group>((size_t)structure[0]) + Arena::need<Elimination>((size_t)structure[1] + 1)) {
         if (!ok()) return;
         groups = arena_.take<Group>((size_t)structure[0]);
-        order = arena_.take<Elimination>((size_t)structure[1]);
+        order = arena_.take<Elimination>((size_t)structure[1] + 1);  // one for driven joints
     }
     bool ok() const { return arena_.ok(); }
     Group *groups = nullptr;

@@ -55,7 +55,7 @@ class RodEquations {
   public:
     explicit RodEquations(const Program &program) : program_(program) {
         int limbs = 0;
-        apply_ = !program.sigma && !program.free;
+        apply_ = !program.sigma && !program.free && !program.frees_drives;
         for (int g = 0; g < program.groups; g++) {
             const Group &group = program.group[g];
             apply_ = apply_ && group.ending == DISTANCE && !group.joints && !group.unknown;

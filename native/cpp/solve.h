@@ -124,35 +124,39 @@ class Solver {
         int64_t asked = 0;
         for (int64_t b = 0; b < count; b++) {
             if (!any(blocks[b].alive)) continue;
-            TaskRows task{(int)answer.conditions, {}, {}};
+            Demands demands;
+            demands.conditions = (int)answer.conditions;
             int64_t last = asked;
             for (int lane = 0; in_.task && lane < W; lane++) {
                 if (blocks[b].alive[lane]) last = asked++;
-                task.residual[lane] = answer.residual + last * answer.conditions;
-                task.slopes[lane] = answer.slopes + last * answer.conditions * 6;
+                demands.residual[lane] = answer.residual + last * answer.conditions;
+                demands.slopes[lane] = answer.slopes + last * answer.conditions * 6;
             }
-            const TaskRows *asked_rows = in_.task ? &task : nullptr;
+            for (int lane = 0; program_.sums && lane < W; lane++) {
+                demands.weights[lane] = locate(in_.weights, blocks[b].trial[lane], 0);
+                demands.values[lane] = locate(in_.values, blocks[b].trial[lane], blocks[b].pose[lane]);
+            }
             if (first)
-                evaluate(blocks[b], blocks[b].now, asked_rows, Mask{}, blocks[b].step, blocks[b].measures);
+                evaluate(blocks[b], blocks[b].now, demands, Mask{}, blocks[b].step, blocks[b].measures);
             else
-                try_coordinates(blocks[b], asked_rows);
+                try_coordinates(blocks[b], demands);
         }
         return 0;
     }
 
-    void try_coordinates(RowBlock &block, const TaskRows *task) const {
+    void try_coordinates(RowBlock &block, const Demands &demands) const {
         block.tried = block.measures;
-        evaluate(block, block.next, task, find_tiny(block), block.further, block.tried);
+        evaluate(block, block.next, demands, find_tiny(block), block.further, block.tried);
         accept(block);
     }
 
-    void evaluate(const RowBlock &block, const Lanes *coordinates, const TaskRows *task,
+    void evaluate(const RowBlock &block, const Lanes *coordinates, const Demands &demands,
                   Mask may_stay, Lanes *step, Measures &measures) const {
         const PlacedUnit &placed = *block.placed;
         if (division_.by_trials)
-            equations_.evaluate(placed.lanes(), coordinates, task, may_stay, block.alive, step, measures);
+            equations_.evaluate(placed.lanes(), coordinates, demands, may_stay, block.alive, step, measures);
         else
-            equations_.evaluate(placed.numbers(), coordinates, task, may_stay, block.alive, step, measures);
+            equations_.evaluate(placed.numbers(), coordinates, demands, may_stay, block.alive, step, measures);
     }
 
     // The same as in `evaluate_all` for rods, two blocks at a time.

@@ -25,6 +25,7 @@ struct SolveInput {
     int64_t t, n, max_iterations;
     loopcal::Task task;
     void *context;
+    loopcal::Strided weights, values;  // of sums of driven joints
 };
 
 struct SolveOutput {
@@ -39,7 +40,8 @@ struct Workspace {
     PlacedUnit *unit = nullptr;
     int64_t *rows = nullptr, blocks, units;
     double *poses = nullptr;
-    Lanes *reduced = nullptr, *low = nullptr, *front = nullptr, *twists = nullptr;
+    Lanes *reduced = nullptr, *low = nullptr, *front = nullptr, *twists = nullptr,
+          *drives = nullptr;
 
     static int most_joints(const Program &program) {
         int most = 0;
@@ -53,8 +55,9 @@ struct Workspace {
         : blocks(block_count), units(unit_count), reduced_(NewtonWork::reduced_of(program)),
           low_((size_t)Equations::low_rows(program, most_conditions) * (program.twists + 1)),
           front_(program.largest_elimination(most_conditions, 1)),
-          steps_(6 * (size_t)program.nodes + program.unknown_joints()),
+          steps_((size_t)program.step_size()),
           values_(12 * (size_t)program.nodes + program.joint_values()), twists_(program.twists + 1),
+          drives_(program.drives + 1),
           joints_(most_joints(program)),
           arena_(need(program)) {
         if (!arena_.ok()) return;
@@ -62,6 +65,7 @@ struct Workspace {
         low = arena_.take<Lanes>(low_);
         front = arena_.take<Lanes>(front_);
         twists = arena_.take<Lanes>(twists_);
+        drives = arena_.take<Lanes>(drives_);
         block = arena_.take<RowBlock>(blocks);
         unit = arena_.take<PlacedUnit>(units);
         rows = arena_.take<int64_t>(blocks * W);
@@ -77,19 +81,19 @@ struct Workspace {
 
     bool ok() const { return arena_.ok(); }
 
-    NewtonWork take_work() { return {Frames(arena_, joints_), reduced, low, front, twists}; }
+    NewtonWork take_work() { return {Frames(arena_, joints_), reduced, low, front, twists, drives}; }
 
   private:
     size_t need(const Program &program) const {
         return Frames::need(joints_) + Arena::need<Lanes>(reduced_) + Arena::need<Lanes>(low_) +
-               Arena::need<Lanes>(front_) + Arena::need<Lanes>(twists_) +
+               Arena::need<Lanes>(front_) + Arena::need<Lanes>(twists_) + Arena::need<Lanes>(drives_) +
                Arena::need<RowBlock>(blocks) +
                Arena::need<PlacedUnit>(units) + Arena::need<int64_t>(blocks * W) +
                Arena::need<double>(12 * blocks * W) + units * PlacedUnit::need(program) +
                blocks * 2 * (Arena::need<Lanes>(values_) + Arena::need<Lanes>(steps_));
     }
 
-    size_t reduced_, low_, front_, steps_, values_, twists_;
+    size_t reduced_, low_, front_, steps_, values_, twists_, drives_;
     int joints_;
     Arena arena_;
 };

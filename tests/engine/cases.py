@@ -22,6 +22,7 @@ from loopcal.engine import (
     ParameterMap,
     Program,
     State,
+    Sums,
     TwistRows,
 )
 from loopcal.io.robot.robot_file import load_robot
@@ -64,6 +65,13 @@ def make_case(robot: Mechanism, t: int = 1, n: int = 5, seed: int = 1) -> Case:
     step = np.array([0.03 * p.size] * p.n_joints if is_by_joint else steps)
     q = actuated_joint_values(p, robot.home_state) + rng.uniform(-1, 1, (t, n, p.n_joints)) * step
     return Case(robot.name, p, e, q, robot.home_state)
+
+
+def draw_sums(case: Case) -> Sums:
+    """Draw weights of as many sums as driven joints, and the sums of the case's joint values."""
+    t, J = len(case.q), case.program.n_joints
+    weights = np.eye(J) + 0.2 * np.random.default_rng(3).normal(size=(t, J, J))
+    return Sums(weights, np.matmul(case.q, weights.swapaxes(1, 2)))
 
 
 def actuated_joint_values(program: Program, state: State) -> Array:

@@ -11,7 +11,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from loopcal import geometry
-from loopcal.engine import CONVERGED, EXHAUSTED, NEAR_GOAL, NOT_FINITE, STALLED, Slot
+from loopcal.engine import CONVERGED, EXHAUSTED, NEAR_GOAL, NOT_FINITE, STALLED, Slot, Sums
 from loopcal.io.robot.robot_file import load_robot
 from loopcal.mechanism.compilation import build
 from tests import zoo
@@ -19,6 +19,7 @@ from tests.engine.cases import (
     actuated_joint_values,
     closure_gap,
     displacement_units,
+    draw_sums,
     make_case,
     pose_demand,
 )
@@ -72,6 +73,37 @@ def test_rows_with_a_goal_elsewhere_end_as_without_it(engine, case):
 def test_actuated_joints_have_the_given_values(engine, case):
     state = engine.solve(case.program, case.e, case.q, case.home)
     assert_array_equal(actuated_joint_values(case.program, state), case.q)
+
+
+def test_sums_of_driven_joints_lead_where_the_joints_do(engine, case):
+    sums, start = draw_sums(case), case.program.list_drives(case.home.joints)
+    state = engine.solve(case.program, case.e, start, case.home, sums=sums)
+    expected = engine.solve(case.program, case.e, case.q, case.home)
+    assert_array_equal(state.status, CONVERGED)
+    # [1] and [m]: rounding times the condition of these robots and of the weights
+    assert_allclose(state.T, expected.T, atol=1e-13)
+    assert_allclose(actuated_joint_values(case.program, state), case.q, atol=1e-13)
+    alone = Sums(sums.weights, sums.values[:, 2:3])
+    assert_same(
+        take_rows(state, [0], [2]), engine.solve(case.program, case.e, start, case.home, sums=alone)
+    )
+
+
+def test_a_task_and_fewer_sums_lead_where_all_sums_do(engine):
+    one = make_case(zoo.hexapod())
+    sums, start = draw_sums(one), one.program.list_drives(one.home.joints)
+    expected = engine.solve(one.program, one.e, one.q, one.home)
+    wanted = expected.T.reshape(-1, 4, 4)
+
+    def place_height(T, rows):
+        slopes = np.zeros((len(rows), 2, 6))
+        slopes[:, [0, 1], [4, 5]] = 1.0
+        return T[:, 1:3, 3] - wanted[rows, 1:3, 3], slopes
+
+    few = Sums(sums.weights[:, 2:], sums.values[..., 2:])
+    state = engine.solve(one.program, one.e, start, one.home, place_height, sums=few)
+    assert_array_equal(state.status, CONVERGED)
+    assert_allclose(state.T, expected.T, atol=1e-12)  # [1] and [m]: rounding times a condition
 
 
 def test_platform_moves_in_its_freedoms_only(engine, case):

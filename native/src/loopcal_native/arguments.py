@@ -6,7 +6,7 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Sequence
 
-from loopcal.engine import ParameterMap, Program, State
+from loopcal.engine import ParameterMap, Program, State, Sums
 from loopcal.typing import FloatArray, IntArray
 from loopcal_native.library import Strided, as_reals, describe
 from loopcal_native.programs import flatten_pattern, require
@@ -61,6 +61,17 @@ def require_rows(
     is_right = array.ndim == 2 + len(end) and array.shape[2:] == end
     is_right = is_right and array.shape[0] in (1, t) and array.shape[1] in (1, n)
     require(is_right, f"{name} ({t} | 1, {n} | 1, {end}), not {array.shape}")
+
+
+def flatten_sums(program: Program, sums: Sums, shape: tuple[int, int]) -> list[FloatArray]:
+    """Return the weights and the values of sums of driven joints."""
+    weights, values, (t, _) = as_reals(sums.weights), as_reals(sums.values), shape
+    require(values.ndim == 3, "sums (t | 1, n | 1, r)")
+    require_rows("sums", values, values.shape[2:], shape)
+    expected = values.shape[2], program.n_joints
+    is_right = weights.shape == (len(weights), *expected) and len(weights) in (1, t)
+    require(is_right, f"weights of sums ({t} | 1, {expected}), not {weights.shape}")
+    return [weights.reshape(len(weights), -1), values]
 
 
 def flatten_inputs(

@@ -18,6 +18,7 @@ from loopcal.engine import (
     Program,
     Reached,
     State,
+    Sums,
     Target,
     Task,
     TwistRows,
@@ -29,6 +30,7 @@ from loopcal.typing import BoolArray, FloatArray
 from loopcal_native.arguments import (
     describe_all,
     flatten_inputs,
+    flatten_sums,
     list_addresses,
     list_joints,
     require_arrays,
@@ -65,7 +67,7 @@ def make_engine(variant: str = "") -> Engine:
     own = NativeFunctions(sets[name])
     functions = own.solve, own.certify, own.reach, own.linearize, own.fold
     functions += own.differentiate, own.fold_poses, own.solve_triangles, own.compare_poses
-    return Engine(f"native:{name}", VERSION, *functions, solves_nodes=True)
+    return Engine(f"native:{name}", VERSION, *functions, is_complete=True)
 
 
 @dataclass(frozen=True)
@@ -84,16 +86,21 @@ class NativeFunctions:
         free: bool = False,
         max_iterations: int = 60,
         goal: State | None = None,
+        sums: Sums | None = None,
     ) -> State:
         """Find the pose and the joints that close every loop."""
         t, n = max(len(e), len(q), len(start.T)), max(q.shape[1], start.T.shape[1])
-        flat, shape = flatten_program(program, free), (t, n)
+        given = list[FloatArray]()
+        if sums is not None:
+            t, n = max(t, *map(len, sums)), max(n, sums.values.shape[1])
+            given = flatten_sums(program, sums, (t, n))
+        shape = t, n
+        flat = flatten_program(program, free, None if sums is None else sums.values.shape[2])
         arrays = [as_reals(e), as_reals(q), as_reals(start.T)]
         joints = list_joints(start)
         require_arrays(program, arrays, joints, shape)
-        if goal is not None:
-            arrays.append(as_reals(goal.T))
-            require(arrays[-1].shape == (t, n, 4, 4), f"a goal ({t}, {n}, 4, 4)")
+        goals = None if goal is None else as_reals(goal.T)
+        require(goal is None or goal.T.shape == (t, n, 4, 4), f"a goal ({t}, {n}, 4, 4)")
         T, residual, iterations, status, sign, *out = allocate(
             ((t, n, 4, 4), float),
             (shape, float),
@@ -108,7 +115,7 @@ class NativeFunctions:
                 self.instruction_set,
                 flat.structure.ctypes.data,
                 flat.numbers.ctypes.data,
-                describe_all([*arrays, *[None] * (4 - len(arrays))]),
+                describe_all([*arrays, goals, *(given or (None, None))]),
                 describe_all(joints),
                 t,
                 n,

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-ABI = 7
+ABI = 8
 """The C interface that this package calls; dispatch.cpp states it, too."""
 NO_MEMORY, TASK_FAILED = 1, 2
 """What functions of the library return, beside 0."""

@@ -13,6 +13,8 @@ from loopcal.typing import FloatArray, IntArray
 
 ENDINGS = {"rigid": 0, "ball": 1, "distance": 2}
 ROWS = {"rigid": 6, "ball": 3, "distance": 1}
+DRIVEN = 6
+"""The first freedom of a limb that is a driven joint whose sums are given; program.h states it."""
 
 
 class FlatProgram(NamedTuple):
@@ -23,27 +25,30 @@ class FlatProgram(NamedTuple):
     unknown: tuple[tuple[int, ...], ...]
 
 
-def flatten_program(program: Program, free: bool) -> FlatProgram:
+def flatten_program(program: Program, free: bool, sums: int | None = None) -> FlatProgram:
     """Return a program as flat arrays; they are kept with it, as its groups keep derived values.
+
+    sums : how many sums of driven joints are given in place of these; None without any.
 
     Raises
     ------
     ValueError : an entry points beyond the arrays of the program.
     """
-    key = f"_native_{free}"
+    key = f"_native_{free}_{sums}"
     kept = vars(program).get(key)
     if kept is None:
-        kept = vars(program)[key] = _flatten(program, free)
+        kept = vars(program)[key] = _flatten(program, free, sums)
     return kept
 
 
-def _flatten(program: Program, free: bool) -> FlatProgram:
+def _flatten(program: Program, free: bool, sums: int | None) -> FlatProgram:
     """Return a program as flat arrays, with the order of program.h."""
     freedoms = list(program.freedoms)
     require(len(freedoms) <= 6 and set(freedoms) <= set(range(6)), "freedoms of a twist")
     whole = [len(program.groups), len(program.nodes)]
     whole += [len(freedoms), program.n_displacements, program.n_joints]
-    whole += [program.sigma is not None, free, *freedoms, *[0] * (6 - len(freedoms))]
+    whole += [program.sigma is not None, free, sums is not None, sums or 0]
+    whole += [*freedoms, *[0] * (6 - len(freedoms))]
     reals: list[FloatArray] = [np.array([program.size], float)]
     if program.sigma is not None:
         require(len(program.sigma) == program.n_joints, "one sigma for each actuator")
@@ -52,14 +57,18 @@ def _flatten(program: Program, free: bool) -> FlatProgram:
     for group in program.groups:
         unknown.append(tuple(group.unknown_joints(free)))
         _require_inside(program, group)
-        whole += _list_structure(program, group, unknown[-1])
+        whole += _list_structure(program, group, unknown[-1], sums is not None)
         reals += [group.links[:, :, :3, :3].reshape(len(group.limbs), -1, 9)]
         origins = group.links[:, :, :3, 3]
         reals[-1] = np.concatenate([reals[-1], origins], axis=2)
         reals += [group.pitch, group.length]
-    whole += [program.may_stay_open, len(program.unknown_twists)]
-    whole += [6 * node + f for node, f in program.unknown_twists]
-    whole += _list_eliminations(program, unknown)
+    places = [6 * node + f for node, f in program.unknown_twists]
+    if sums is not None:  # driven joints are the last part of a step
+        counts = (len(g.limbs) * len(own) for g, own in zip(program.groups, unknown, strict=True))
+        first = 6 * len(program.nodes) + sum(counts)
+        places += range(first, first + program.n_joints)
+    whole += [program.may_stay_open, len(places), *places]
+    whole += _list_eliminations(program, unknown, sums)
     numbers = np.concatenate([np.asarray(a, np.float64).ravel() for a in reals])
     return FlatProgram(np.array(whole, np.int64), numbers, tuple(unknown))
 
@@ -111,13 +120,20 @@ def _list_entries(program: Program, pattern: MapPattern, functions: int) -> IntA
     return np.concatenate(of_limbs).astype(np.int64)
 
 
-def _list_eliminations(program: Program, unknown: Sequence[tuple[int, ...]]) -> list[int]:
+def _list_eliminations(
+    program: Program, unknown: Sequence[tuple[int, ...]], sums: int | None
+) -> list[int]:
     """Return rows and columns of the elimination of each node, as `Elimination` of program.h; the
     rows have the order of the NumPy engine, so that determinants have equal signs.
     """
-    columns: dict[int, list[int]] = {node: [] for node in range(len(program.nodes))}
+    drives = len(program.nodes)  # the number of the node of driven joints
+    columns: dict[int, list[int]] = {node: [] for node in range(drives + 1)}
     for i, (node, _) in enumerate(program.unknown_twists):
         columns[node].append(i)
+    twists, order = len(program.unknown_twists), program.elimination_order
+    if sums is not None:
+        columns[drives] = list(range(twists, twists + program.n_joints))
+        order = (*order[:-1], drives, order[-1])
     fronts: list[tuple[tuple[int, ...], list[int]]] = []
     first = 0
     for group, joints in zip(program.groups, unknown, strict=True):
@@ -128,10 +144,14 @@ def _list_eliminations(program: Program, unknown: Sequence[tuple[int, ...]]) -> 
         for pair in dict.fromkeys(ends):
             own = [k for k, other in enumerate(ends) if other == pair]
             rows = [first + count * k + i for k in own for i in range(count)]
-            fronts.append((tuple(node for node in pair if node != BASE), rows))
+            nodes = tuple(node for node in pair if node != BASE)
+            fronts.append((nodes if sums is None else (*nodes, drives), rows))
         first += count * len(ends)
+    if sums is not None:
+        fronts.append(((drives,), list(range(first, first + sums))))
+        first += sums
     begin, alone, out = first, fronts.copy(), []
-    for node in program.elimination_order:
+    for node in order:
         own = [front for front in fronts if node in front[0]]
         near = sorted({other for nodes, _ in own for other in nodes} - {node})
         rows = [row for _, of_front in own for row in of_front]
@@ -143,12 +163,14 @@ def _list_eliminations(program: Program, unknown: Sequence[tuple[int, ...]]) -> 
         fronts = [front for front in fronts if node not in front[0]]
         fronts.append((tuple(near), rows[len(columns[node]) :]))
     task = sum(len(rows) for nodes, rows in alone if nodes == (PLATFORM,))
-    if not program.others:
+    if len(order) == 1:
         return [0, 0]
     return [first - begin, task, *out]
 
 
-def _list_structure(program: Program, group: Group, unknown: tuple[int, ...]) -> list[int]:
+def _list_structure(
+    program: Program, group: Group, unknown: tuple[int, ...], frees_drives: bool
+) -> list[int]:
     """Return the integers of a group."""
     joints, links = len(group.joints), len(group.joints) + 2
     turned = {slot.element for slot in group.slots if slot.axis < 3}
@@ -158,10 +180,13 @@ def _list_structure(program: Program, group: Group, unknown: tuple[int, ...]) ->
     ends = (group.on[0], group.to[0])
     begun, ended = ([] if node == BASE else list(program.nodes[node]) for node in ends)
     place = {twist: i for i, twist in enumerate(program.unknown_twists)}
-    out += [len(unknown), first, len(begun), len(begun + ended), *begun, *ended]
+    driven = group.driven_joints if frees_drives else []
+    out += [len(unknown), first, len(begun), len(begun + ended + driven), *begun, *ended]
+    out += [DRIVEN + j for j in driven]
     out += [end for pair in zip(group.on, group.to, strict=True) for end in pair]
-    for on, to in zip(group.on, group.to, strict=True):
+    for k, (on, to) in enumerate(zip(group.on, group.to, strict=True)):
         out += [place[on, f] for f in begun] + [place[to, f] for f in ended]
+        out += [len(place) + int(group.actuator[j, k]) for j in driven]
     out += group.rows
     out += [letter == "R" for letter in group.joints]
     out += [*unknown, *group.actuator.ravel().tolist()]

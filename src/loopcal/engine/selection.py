@@ -67,8 +67,8 @@ class Engine:
 
     name : as in LOOPCAL_ENGINE, with its variant. version : of the package that computes.
     solve_triangles, compare_poses : None where the functions of `loopcal.numerics` and of
-        `loopcal.geometry` do it. solves_nodes : whether programs may have nodes but the platform;
-        NumPy computes those of an engine that does not.
+        `loopcal.geometry` do it. is_complete : whether programs may have nodes but the platform,
+        and sums of driven joints may be given; NumPy computes these for an engine that is not.
     """
 
     name: str
@@ -82,7 +82,7 @@ class Engine:
     fold_poses: Callable[..., tuple[FloatArray, BoolArray]]
     solve_triangles: Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]] | None = None
     compare_poses: Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]] | None = None
-    solves_nodes: bool = False
+    is_complete: bool = False
 
     def __str__(self) -> str:
         return f"{self.name} {self.version}"
@@ -126,7 +126,7 @@ def _make_numpy_engine() -> Engine:
     from loopcal.engine.numpy_engine.targets import reach
 
     functions = solve, certify, reach, linearize, fold, differentiate, fold_poses
-    return Engine(NUMPY, np.__version__, *functions, solves_nodes=True)
+    return Engine(NUMPY, np.__version__, *functions, is_complete=True)
 
 
 def _is_native_installed() -> bool:
@@ -156,10 +156,10 @@ def get_current_engine() -> Engine:
     return select_engine(os.environ.get(VARIABLE, ""))
 
 
-def _get_engine_for(program: Program) -> Engine:
-    """Return the current engine, or NumPy for nodes that it does not solve."""
-    current = get_current_engine()
-    return current if current.solves_nodes or not program.others else _make_numpy_engine()
+def _get_engine_for(program: Program, sums: Sums | None = None) -> Engine:
+    """Return the current engine, or NumPy for nodes and sums that it does not solve."""
+    current, is_plain = get_current_engine(), not program.others and sums is None
+    return current if current.is_complete or is_plain else _make_numpy_engine()
 
 
 def solve(
@@ -180,19 +180,16 @@ def solve(
     start : first guess, (t | 1, n | 1) rows.
     task : conditions on the pose, as many as the freed actuators leave open.
     free : solve for the actuated joints too.
-    sums : solve for the actuated joints too, of which these sums are given; NumPy computes it.
+    sums : solve for the actuated joints too, of which these sums are given.
     goal : solutions (t, n); a row ends as NEAR_GOAL as soon as its next step leads close to its
         goal, to which further steps would converge. Its coordinates are those before that step.
 
     Rows that fail are marked in `status`; nothing is raised. The closure sign is that of the limbs
     that constrain the platform: a limb whose joints only follow it may pass its own singularities.
     """
-    if sums is None:
-        current = _get_engine_for(program)
-        state = current.solve(program, e, q, start, task, free, max_iterations, goal)
-    else:
-        current = _make_numpy_engine()
-        state = current.solve(program, e, q, start, task, free, max_iterations, goal, sums)
+    current = _get_engine_for(program, sums)
+    given = () if sums is None else (sums,)
+    state = current.solve(program, e, q, start, task, free, max_iterations, goal, *given)
     if not program.idle_groups:
         return state
     joints = tuple(state.joints[i] for i in program.idle_groups)

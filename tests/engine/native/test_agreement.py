@@ -12,7 +12,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from loopcal.engine import select_engine
 from loopcal.io.robot.robot_file import load_robot
 from loopcal.mechanism.platform_coordinates import read_coordinates, state_target
-from tests.engine.cases import displacement_units, draw_map, make_pose_rows, pose_demand
+from tests.engine.cases import displacement_units, draw_map, draw_sums, make_pose_rows, pose_demand
 from tests.engine.native.instruction_sets import list_arrays, make_engines, make_robot_case
 from tests.engine.test_compare_poses import draw_poses
 from tests.engine.test_triangles import make_systems
@@ -46,6 +46,23 @@ def test_states_agree_with_numpy_and_between_instruction_sets(name, t, n):
     assert_allclose(actual.T / scale, expected.T / scale, atol=ROUNDING)
     for mine, theirs in zip(actual.joints, expected.joints, strict=True):
         assert_allclose(mine, theirs, atol=ROUNDING * max(case.program.size, 1.0))
+    assert_same_bits(solved)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ROBOTS)
+@pytest.mark.parametrize(("t", "n"), [(1, 9), (5, 3)])
+def test_states_at_sums_agree_with_numpy_and_between_instruction_sets(name, t, n):
+    case = make_robot_case(name, t, n)
+    start, sums = case.program.list_drives(case.home.joints), draw_sums(case)
+    arguments = case.program, case.e, start, case.home, None, False, 60, None, sums
+    expected, solved = NUMPY.solve(*arguments), [e.solve(*arguments) for e in ENGINES.values()]
+    for field in ("status", "iterations", "closure_sign"):
+        assert_array_equal(getattr(solved[0], field), getattr(expected, field))
+    # [1] and [m]: rounding times the condition of these robots and of the weights
+    assert_allclose(solved[0].T, expected.T, atol=1e-13)
+    for mine, theirs in zip(solved[0].joints, expected.joints, strict=True):
+        assert_allclose(mine, theirs, atol=1e-13)
     assert_same_bits(solved)
 
 

@@ -8,7 +8,17 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from loopcal.engine import CONVERGED, NOT_FINITE, Engine, Program, Slot, State, Target, TwistRows
+from loopcal.engine import (
+    CONVERGED,
+    NOT_FINITE,
+    Engine,
+    Program,
+    Slot,
+    State,
+    Sums,
+    Target,
+    TwistRows,
+)
 from loopcal.errors import MissingPackageError
 from tests.engine.cases import draw_map, draw_twist_rows, make_pose_rows
 from tests.engine.native.instruction_sets import make_engines, make_robot_case
@@ -46,6 +56,15 @@ WRONG_CALLS = {
     "slots": (change_group(PROGRAM, slots=(Slot(99, 0),) * len(GROUP.slots)), E, Q, HOME),
     "columns": (change_group(PROGRAM, columns=slice(0, 1)), E, Q, HOME),
 }
+
+
+@pytest.mark.parametrize(
+    ("weights", "values"),
+    [((1, 2, 3), (1, 3, 2)), ((3, 2, 2), (2, 3, 2)), ((1, 1, 2), (1, 3, 2)), ((1, 2, 2), (3, 2))],
+)
+def test_sums_of_wrong_shape_are_refused(weights, values):
+    with pytest.raises(ValueError, match="sums"):
+        NATIVE.solve(PROGRAM, E, Q, HOME, sums=Sums(np.ones(weights), np.ones(values)))
 
 
 @pytest.mark.parametrize("what", WRONG_CALLS)

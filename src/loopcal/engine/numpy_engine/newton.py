@@ -333,7 +333,7 @@ class _Equations:
         for group, theta in zip(self.program.groups, limbs, strict=True):
             for j in group.driven_joints:
                 q[group.actuator[j]] = theta[j]
-        return np.einsum("Nrj,jN->rN", self.sums.weights, q) - self.sums.values.T
+        return add_terms(self.sums.weights.T * q[:, None]) - self.sums.values.T
 
     def evaluate(self, coordinates: FloatArray, together: bool = False) -> Iterate:
         """Return the Newton step at these coordinates and its measures.
@@ -376,7 +376,8 @@ class _Equations:
         for i, (group, top) in enumerate(zip(program.groups, tops, strict=True)):
             if u := len(top):
                 own = gather_unknowns(program, group, y)
-                rest = turns[i] + np.add.reduce(top[:, u : u + len(own)] * own, axis=1)
+                columns = top[:, u : u + len(own)].swapaxes(0, 1)
+                rest = turns[i] + add_terms(np.multiply(columns, own[:, None], order="C"))
                 turns[i] = back_substitute(top[:, :u], -rest[:, None])[:, 0]
         driven = y.get(len(program.nodes), np.zeros((0, N)))
         step = np.concatenate([twist, *(turn.reshape(-1, N) for turn in turns), driven])

@@ -93,10 +93,9 @@ def solve_nodes(
         m = first = program.widths[node]
         right = -rows[:, -sides:] if sides else rows[:, :0]
         for other in others:
-            y = known[other]
-            last = first + len(y)
-            right = right - np.einsum("ri...,is...->rs...", rows[:, first:last], y)
-            first = last
+            for y in known[other]:  # one after the other, whatever the number of rows
+                right = right - rows[:, first, None] * y
+                first += 1
         known[node] = back_substitute(rows[:, :m], right)
         yield node, known[node]
 
