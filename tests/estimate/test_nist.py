@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Certified nonlinear regression: the descent agrees with the values and standard errors of NIST.
 
-Pass marks: 6 matching digits for values and 4 for standard errors, from both official starts.
-Lanczos1 needs 2 for standard errors, because its residuals are the rounding of its printed data
-(sum of squares 1.4e-25).
+Pass marks: 7 matching digits for values and for standard errors, from both official starts, with
+default settings. Lanczos1 needs 2 for standard errors, because its residuals are the rounding of
+its printed data (sum of squares 1.4e-25). Lanczos3 needs 6 for those from its second start:
+standard errors come from the rows before the last step, and a step of 1e-8 of its nearly collinear
+exponentials changes them by 4e-7.
 """
 
 import sys
@@ -65,20 +67,6 @@ def fit_regression(certified: Certified, start: np.ndarray, control: StepControl
     return problem, fit, count[0]
 
 
-def score_fit(certified: Certified, start: np.ndarray) -> tuple[float, float, int, str]:
-    """Fit and return matching digits of values and of standard errors, accepted steps, status."""
-    problem, fit, _ = fit_regression(certified, start, StepControl(relative=1e-8))
-    errors = fit.decomposition.standard_deviations(fit.penalty, fit.cost / certified.degrees)[
-        0
-    ] * np.abs(start)
-    return (
-        matching_digits(problem.values(fit.deviation[0]), certified.values),
-        matching_digits(errors, certified.standard_errors),
-        int(fit.iterations[0]),
-        DescentStatus(fit.status[0]).name,
-    )
-
-
 @pytest.fixture(scope="module")
 def default_fits(data_folder: Path):
     """Fits of every set from both starts with the default settings."""
@@ -99,28 +87,60 @@ def test_default_settings_converge_to_the_certified_values(default_fits):
 
 def test_narrow_valleys_take_few_evaluations(default_fits):
     """A damped descent by Nielsen's rule alone takes 3012 evaluations for all, 290 and more for
-    each of Bennett5, and 78 for Lanczos3."""
+    each of Bennett5, and 78 for Lanczos3. Seven digits take 1803; 1660 give five for ENSO, whose
+    steps become shorter by a third only."""
     counts = [count for _, (_, _, count) in default_fits]
-    assert sum(counts) <= 1700
+    assert sum(counts) <= 1850
     most = {c.name: count for c, (_, _, count) in default_fits[::2]}
     assert max(most[name] for name in ("Bennett5", "Lanczos1", "Lanczos2", "Lanczos3")) <= 30
 
 
+def score_fit(certified: Certified, problem: Regression, fit) -> tuple[float, float, int, str]:
+    """Return matching digits of values and of standard errors, accepted steps, status."""
+    errors = fit.decomposition.standard_deviations(fit.penalty, fit.cost / certified.degrees)[0]
+    return (
+        matching_digits(problem.values(fit.deviation[0]), certified.values),
+        matching_digits(errors * np.abs(problem.start), certified.standard_errors),
+        int(fit.iterations[0]),
+        DescentStatus(fit.status[0]).name,
+    )
+
+
 @pytest.fixture(scope="module")
-def scores(data_folder: Path) -> dict[tuple[str, int], tuple[float, float, int, str]]:
-    """Matching digits of every set from both starts."""
-    sets = [read_data_set(path) for path in sorted((data_folder / "nist").glob("*.dat"))]
-    assert {c.name for c in sets} == set(MODELS)
-    return {(c.name, i + 1): score_fit(c, c.starts[i]) for c in sets for i in range(2)}
+def scores(default_fits) -> dict[tuple[str, int], tuple[float, float, int, str]]:
+    """Matching digits of every set from both starts, with the default settings."""
+    assert {certified.name for certified, _ in default_fits} == set(MODELS)
+    return {
+        (certified.name, 1 + i % 2): score_fit(certified, problem, fit)
+        for i, (certified, (problem, fit, _)) in enumerate(default_fits)
+    }
+
+
+FEWER_DIGITS = {("Lanczos1", 1): 2.0, ("Lanczos1", 2): 2.0, ("Lanczos3", 2): 6.0}
+"""Digits of the standard errors where these are fewer than 7, see above."""
 
 
 @pytest.mark.parametrize("name", sorted(MODELS))
 @pytest.mark.parametrize("start", [1, 2])
-def test_nist_values_match_to_6_digits_and_standard_errors_to_4(scores, name, start):
+def test_nist_values_and_standard_errors_match_to_7_digits(scores, name, start):
     values, errors, _, status = scores[name, start]
     assert status == "CONVERGED"
-    assert values >= 6.0
-    assert errors >= (2.0 if name == "Lanczos1" else 4.0)
+    assert values >= 7.0
+    assert errors >= FEWER_DIGITS.get((name, start), 7.0)
+
+
+@pytest.mark.parametrize("relative", [1e-8, 1e-12])
+def test_a_stricter_end_gives_no_fewer_digits(data_folder: Path, scores, relative):
+    """The last step is taken where the sum of squares only shows rounding."""
+    for name in ("Chwirut1", "Gauss1", "Hahn1", "Rat43"):
+        certified = read_data_set(data_folder / "nist" / f"{name}.dat")
+        control = StepControl(relative=relative)
+        for start in (1, 2):
+            problem, fit, _ = fit_regression(certified, certified.starts[start - 1], control)
+            values, errors, _, status = score_fit(certified, problem, fit)
+            assert status == "CONVERGED"
+            assert values >= min(scores[name, start][0], 9.5)
+            assert errors >= min(scores[name, start][1], 9.0)
 
 
 def test_matching_digits_of_every_nist_data_set_are_printed(scores, capsys):

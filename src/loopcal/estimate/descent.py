@@ -184,11 +184,19 @@ ROUNDING_STEP, SMALL_STEP, SHORTEST_STEP = 1e-6, 1e-3, 1e-9
 decrease has met rounding: the trial converged. So has one that was damped below SHORTEST_STEP
 without a decrease, if its full step is below SMALL_STEP."""
 
+AS_LOW = 1.0 + 1e-9
+"""Ratio to which rounding may raise a sum of squares: residuals are rounded at the size of the
+robot, more than the sum itself."""
+
 MOST_ITERATIONS = 1000
 """Evaluations of the rows: far more than fits need, since those without progress end early."""
 
-CONTRACTION = 0.25
-"""Largest ratio of two steps from which the lengths of further ones are expected."""
+CONTRACTION, SLOWEST = 0.25, 0.1
+"""Largest ratio of two steps from which a chord may end, and the least difference from 1 of a ratio
+with which the length of all further steps is expected."""
+
+FURTHER = 1e-3
+"""Share of what the last step may change that all further steps may change together."""
 
 FIRST_DAMPING = 1e-6
 """Damping after the first rejected step, in units of the largest squared singular value."""
@@ -248,8 +256,9 @@ class StepControl:
     ----------
     iterations : evaluations of the rows after the first, at most.
     relative : converged when the step changes the whitened residuals by at most this share of their
-        norm. That step is still taken, without evaluating the rows again: the result is the
-        solution of the last decomposition.
+        norm, and all further ones together would by at most a thousandth of it, as the ratio of the
+        last two full steps lets expect. That step is still taken, without evaluating the rows
+        again: the result is the solution of the last decomposition.
     absolute : converged when the step is at most this long, in tolerances, relative to 1 + |z|.
     damping : of the first step, in units of the largest squared singular value; zero tries the full
         step.
@@ -515,34 +524,36 @@ class _Run:
             last, going = active[is_last], np.flatnonzero(~is_last)
             self.chains.is_ahead[last] = False
             self.status[last] = DescentStatus.CONVERGED
-            self.taken[last] += 1
-            z = self.point.z.copy()
-            z[last] = step.target[is_last]
-            self.point = replace(self.point, z=z)
+            self._take_last(last, step.target[is_last])
             active = active[going]
             if active.size:
                 current, step = current.take(going), step.take(going)
         return active, current, step
 
+    def _take_last(self, trials: IntArray, target: FloatArray) -> None:
+        """Move trials (a,) to the ends (a, p) of their full steps; the rows stay those before."""
+        z = self.point.z.copy()
+        z[trials] = target
+        self.point, self.taken[trials] = replace(self.point, z=z), self.taken[trials] + 1
+
     def is_negligible(self, point: _Point, step: FilteredStep) -> BoolArray:
         """Return which steps are the last."""
-        by_residuals = step.change <= self.control.relative**2 * point.cost
+        change, limit = np.sqrt(step.change), self.control.relative * np.sqrt(point.cost)
+        ratio = change / np.maximum(point.arrival, np.finfo(np.float64).tiny)
+        remaining = change * ratio / np.maximum(1.0 - ratio, SLOWEST)
+        by_residuals = (change <= limit) & (remaining <= FURTHER * limit)
         is_last = by_residuals | (step.full_length <= self.control.absolute * point.spread)
         if not self.sufficient:
             return is_last
-        change = np.sqrt(step.change)
-        ratio = change / np.maximum(point.arrival, np.finfo(np.float64).tiny)
-        remaining = change * ratio / np.maximum(1.0 - ratio, 1.0 - CONTRACTION)
-        return is_last | ((ratio <= CONTRACTION) & (remaining <= self.sufficient))
+        is_known = np.isfinite(point.arrival) & (ratio <= CONTRACTION)
+        return is_last | (is_known & (remaining <= self.sufficient))
 
     def evaluate(
         self, active: IntArray, current: _Point, step: FilteredStep, round_number: int
     ) -> bool:
         """Evaluate steps of trials (a,) and take those that are accepted; return whether any."""
         linearized = self.problem.take(active).linearize(step.deviation, current.start)
-        is_full = step.length >= step.full_length
-        arrival = np.where(is_full, np.sqrt(step.change), np.inf)
-        candidate = _Candidate(self, _clear_failed(linearized), arrival)
+        candidate = _Candidate(self, _clear_failed(linearized), np.sqrt(step.change))
         cost, chains, reference = candidate.linearized.cost, self.chains, current
         ahead = chains.is_ahead[active]
         if has_chains := ahead.any():
@@ -556,6 +567,11 @@ class _Run:
         else:
             self.damping.adapt(active, accepted, ratio)
         self.status[active] = status
+        # a sum of squares tells less than its gradient: the step is right, its gain is lost in
+        # rounding
+        met_rounding = (status == DescentStatus.CONVERGED.value) & (cost <= AS_LOW * reference.cost)
+        if met_rounding.any():
+            self._take_last(active[met_rounding], step.target[met_rounding])
         chains.record(step, candidate, active, accepted, ratio, was_full)
         if round_number >= PATIENCE:  # most trials have converged before
             finite = np.isfinite(cost)[single]

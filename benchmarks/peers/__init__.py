@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
+"""loopcal beside Ceres, scipy and jax: the same fits in one run, `python -m benchmarks.peers`."""
