@@ -630,54 +630,58 @@ def align_point_sets(points: FloatArray, reference: FloatArray) -> FloatArray:
     return make_pose(R, center - R @ middle)
 
 
-def minimize_over_rotations(H: FloatArray, g: FloatArray, count: int = 3) -> FloatArray:
-    """Return the rotations (k, 3, 3) at the lowest local minima of `v' H v - 2 g' v`, at most
-    `count` different ones, for positive semidefinite H (9, 9).
+def minimize_over_rotations(H: FloatArray, g: FloatArray, count: int = 3) -> list[FloatArray]:
+    """Return for each of s forms the rotations (k, 3, 3) at the lowest local minima of
+    `v' H v - 2 g' v`, at most `count` different ones, for positive semidefinite H (s, 9, 9).
 
     The vector v holds the nine entries of R row by row. Newton's method on the rotation group, with
     the absolute curvatures and a radius that a failed step quarters, begins at the rotation nearest
     to the unconstrained minimum and at the 24 rotations of a cube. Near a minimum it converges
     quadratically however large the residual is, where Gauss-Newton does not.
     """
-    unconstrained = project_to_rotations(solve_least_squares(H, g).reshape(3, 3))
-    R = np.concatenate([unconstrained[None], OCTAHEDRAL_ROTATIONS])
-    size = max(float(np.trace(H)), TINY)
-    H, g = H / size, g / size  # values and curvatures of order one
-    value = _evaluate_form(H, g, R)
+    free = [solve_least_squares(*each).reshape(1, 3, 3) for each in zip(H, g, strict=True)]
+    cube = np.broadcast_to(OCTAHEDRAL_ROTATIONS, (len(H), *OCTAHEDRAL_ROTATIONS.shape))
+    R = np.concatenate([project_to_rotations(np.array(free)), cube], axis=1).reshape(-1, 3, 3)
+    of = np.repeat(np.arange(len(H)), 1 + len(OCTAHEDRAL_ROTATIONS))
+    size = np.maximum(np.trace(H, axis1=1, axis2=2), TINY)[:, None]
+    H, g = H / size[..., None], g / size  # values and curvatures of order one
+    value = _evaluate_form(H[of], g[of], R)
     radius, active = np.ones(len(R)), np.arange(len(R))
     for _ in range(NEWTON_STEPS):
         if not active.size:
             break
-        step = _find_newton_step(H, g, R[active])
+        form, linear = H[of[active]], g[of[active]]
+        step = _find_newton_step(form, linear, R[active])
         length = np.linalg.norm(step, axis=1)
         longest = np.minimum(length, radius[active])
         moved = exp_so3(step * (longest / np.maximum(length, TINY))[:, None]) @ R[active]
-        new_value = _evaluate_form(H, g, moved)
+        new_value = _evaluate_form(form, linear, moved)
         better = new_value < value[active] + ROUNDING
         R[active[better]], value[active[better]] = moved[better], new_value[better]
         radius[active] = np.where(better, np.minimum(1.0, 2.0 * radius[active]), 0.25 * longest)
         active = active[longest > ROTATION_CHANGE]
-    return _select_distinct(R[np.argsort(value)])[:count]
+    ends = zip(np.split(R, len(H)), np.split(value, len(H)), strict=True)
+    return [_select_distinct(each[np.argsort(of_each)])[:count] for each, of_each in ends]
 
 
 def _evaluate_form(H: FloatArray, g: FloatArray, R: FloatArray) -> FloatArray:
-    """Return `v' H v - 2 g' v` (k,) of rotations R (k, 3, 3)."""
+    """Return `v' H v - 2 g' v` (k,) of rotations R (k, 3, 3), each with its form."""
     v = R.reshape(-1, 9)
-    return np.einsum("ki,ki->k", v @ H - 2.0 * g, v)
+    return (((v[:, None] @ H)[:, 0] - 2.0 * g) * v).sum(axis=1)
 
 
 def _find_newton_step(H: FloatArray, g: FloatArray, R: FloatArray) -> FloatArray:
     """Return rotation vectors w (k, 3) from R (k, 3, 3): minus the gradient of half the form by w
     in exp(w) R, over the absolute values of its curvatures.
     """
-    slope = R.reshape(-1, 9) @ H - g
-    first = np.einsum("iab,kbc->kiac", GENERATORS, R).reshape(-1, 3, 9)
-    second = np.einsum("iab,jbd,kdc->kijac", GENERATORS, GENERATORS, R).reshape(-1, 3, 3, 9)
-    bend = np.einsum("kije,ke->kij", second, slope)
+    slope = (R.reshape(-1, 1, 9) @ H)[:, 0] - g
+    first = (GENERATORS @ R[:, None]).reshape(-1, 3, 9)
+    second = (GENERATORS[:, None] @ GENERATORS @ R[:, None, None]).reshape(-1, 3, 3, 9)
+    bend = (second @ slope[:, None, :, None])[..., 0]
     curvature = first @ H @ np.swapaxes(first, 1, 2) + 0.5 * (bend + np.swapaxes(bend, 1, 2))
     size, axes = np.linalg.eigh(curvature)
-    along = np.einsum("kji,kje,ke->ki", axes, first, slope)
-    return -np.einsum("kij,kj->ki", axes, along / np.maximum(np.abs(size), FLATTEST))
+    along = (np.swapaxes(axes, 1, 2) @ first @ slope[..., None])[..., 0]
+    return -(axes @ (along / np.maximum(np.abs(size), FLATTEST))[..., None])[..., 0]
 
 
 def _select_distinct(R: FloatArray) -> FloatArray:
@@ -740,25 +744,35 @@ def solve_hand_eye(
 
 def solve_frame_and_points(
     measured: FloatArray, moving: FloatArray, constant: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return candidates of a frame (k, 4, 4) and of the coordinates p (k, w) of points on a moving
-    body with `R measured + t = moving p + constant`, for measured (q, 3), moving (q, 3, w) and
-    constant (q, 3).
+) -> list[tuple[FloatArray, FloatArray]]:
+    """Return for each of s sets candidates of a frame (k, 4, 4) and of the coordinates p (k, w) of
+    points on a moving body with `R measured + t = moving p + constant`, for measured (s, q, 3), NaN
+    where missing, moving (s, q, 3, w) and constant (s, q, 3).
 
     For a given rotation R the other unknowns enter linearly. Eliminating them leaves a quadratic
     form of R.
     """
-    q, w = len(measured), moving.shape[-1]
-    C = np.concatenate([moving, -np.broadcast_to(np.eye(3), (q, 3, 3))], axis=-1).reshape(
-        3 * q, w + 3
-    )
-    M = (np.eye(3)[None, :, :, None] * measured[:, None, None, :]).reshape(3 * q, 9)
-    Q = _column_space(C)
-    b = constant.ravel()
-    M_out, b_out = M - Q @ (Q.T @ M), b - Q @ (Q.T @ b)
-    R = minimize_over_rotations(M_out.T @ M_out, M_out.T @ b_out)
-    rest = solve_least_squares(C, (M @ R.reshape(-1, 9).T) - b[:, None]).T
-    return make_pose(R, rest[:, w:]), rest[:, :w]
+    (s, q), w = measured.shape[:2], moving.shape[-1]
+    is_there = np.asarray(~np.isnan(measured).any(axis=-1))[..., None]
+    fixed = np.broadcast_to(-np.eye(3), (s, q, 3, 3))
+    C = np.concatenate([moving, fixed], axis=-1) * is_there[..., None]
+    C = C.reshape(s, 3 * q, w + 3)
+    known = np.where(is_there, measured, 0.0)
+    M = (np.eye(3)[:, :, None] * known[:, :, None, None, :]).reshape(s, 3 * q, 9)
+    b = (constant * is_there).reshape(s, 3 * q, 1)
+    Q, size, V = np.linalg.svd(C, full_matrices=False)
+    used = are_nonzero(size, ALIGNMENT_TOLERANCE)[:, None, :]
+    Q = Q * used
+    both = np.concatenate([M, b], axis=-1)
+    out = both - Q @ (np.swapaxes(Q, 1, 2) @ both)
+    form = np.swapaxes(out[..., :9], 1, 2) @ out
+    solutions = []
+    rotations = minimize_over_rotations(form[..., :9], form[..., 9])
+    inverse = np.swapaxes(V, 1, 2) / np.where(used, size[:, None, :], np.inf)
+    for j, R in enumerate(rotations):
+        rest = (inverse[j] @ (Q[j].T @ (M[j] @ R.reshape(-1, 9).T - b[j]))).T
+        solutions.append((make_pose(R, rest[:, w:]), rest[:, :w]))
+    return solutions
 
 
 def solve_resection(rays: FloatArray, points: FloatArray) -> FloatArray:
@@ -774,7 +788,7 @@ def solve_resection(rays: FloatArray, points: FloatArray) -> FloatArray:
     C = across.reshape(-1, 3)
     Q = _column_space(C)
     out = M - Q @ (Q.T @ M)
-    A = minimize_over_rotations(out.T @ out, np.zeros(9), count=8)
+    A = minimize_over_rotations((out.T @ out)[None], np.zeros((1, 9)), count=8)[0]
     s = solve_least_squares(C, M @ A.reshape(-1, 9).T).T
     ahead = np.einsum("ri,kij,rj->kr", rays, A, points - middle) - np.einsum("ri,ki->kr", rays, s)
     order = np.argsort(-np.mean(ahead > 0.0, axis=1), kind="stable")

@@ -12,11 +12,11 @@ from numpy.testing import assert_allclose
 
 import loopcal as lc
 import loopcal.estimate.pose_rows as blocks_module
+import loopcal.estimate.problem as problem_module
 from loopcal import geometry
 from loopcal.apply.validation import validate
 from loopcal.cli.entry_point import main
 from loopcal.diagnose.outliers import find_outliers
-from loopcal.estimate.elimination import NuisanceElimination
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.identification import identify, identify_trials
 from loopcal.estimate.information import observe_poses, observe_rows
@@ -345,11 +345,11 @@ def test_trials_with_unknown_frames_equal_single_fits():
 
 def test_setup_start_values_are_computed_once_for_all_trials(monkeypatch):
     sought = []
-    begin = NuisanceElimination.start_values
+    begin = problem_module.guess_nuisance_values_batch
     monkeypatch.setattr(
-        NuisanceElimination,
-        "start_values",
-        lambda nuisance, data, *rest: (sought.append(data), begin(nuisance, data, *rest))[1],
+        problem_module,
+        "guess_nuisance_values_batch",
+        lambda data, *rest: (sought.append(data), begin(data, *rest))[1],
     )
     robot = lc.load_robot("linear-delta")
     kind = Position(places=POINT, unknown=("frame",))

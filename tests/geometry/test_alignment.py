@@ -32,7 +32,7 @@ def test_lowest_minimum_is_the_one_that_scipy_reaches_from_many_starts(seed):
     A, b = rng.normal(size=(12, 9)), rng.normal(size=12)
     lowest = minimize_from_random_rotations(A, b, rng)
     for scale in (1e-3, 1.0, 1e3):
-        R = minimize_over_rotations(scale**2 * A.T @ A, scale**2 * A.T @ b)[0]
+        R = minimize_over_rotations((scale**2 * A.T @ A)[None], (scale**2 * A.T @ b)[None])[0][0]
         assert np.allclose(R @ R.T, np.eye(3), atol=1e-12)
         assert cost(R, A, b) <= lowest * (1.0 + 1e-9)
 
@@ -44,5 +44,5 @@ def test_rotation_of_points_in_a_plane_is_recovered(seed):
     points = np.column_stack([rng.normal(size=(8, 2)), np.zeros(8)])
     A = np.concatenate([np.kron(np.eye(3), point) for point in points])
     b = (points @ truth.T).ravel()
-    R = minimize_over_rotations(A.T @ A, A.T @ b)[0]
+    R = minimize_over_rotations((A.T @ A)[None], (A.T @ b)[None])[0][0]
     assert np.abs(R - truth).max() < 1e-9

@@ -436,7 +436,8 @@ def test_units_of_files_do_not_matter_to_a_scale(tmp_path):
         for name in ("mm", "m")
     ]
     sd = fits[0].standard_deviations
-    assert np.allclose(fits[0].estimate, fits[1].estimate, rtol=0.0, atol=1e-5 * sd.min())
+    # a fit ends where a step changes residuals by a millionth of their norm, 7e-6 deviations here
+    assert (np.abs(fits[0].estimate - fits[1].estimate) <= 1e-5 * sd).all()
     assert np.allclose(sd, fits[1].standard_deviations, rtol=1e-6)
     # the gantry does not know its size, and residuals below the noise say nothing of it
     assert fits[1].residual_test.sigma_scale < 0.97

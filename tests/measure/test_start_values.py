@@ -21,7 +21,8 @@ from evidence.starts import (
 from loopcal import geometry
 from loopcal.errors import DataError
 from loopcal.geometry import OCTAHEDRAL_ROTATIONS, solve_trilateration
-from loopcal.measure.initial_values import guess_nuisance_values
+from loopcal.measure import initial_values
+from loopcal.measure.initial_values import guess_nuisance_values, guess_nuisance_values_batch
 from loopcal.measure.kinds.directions import Direction
 from loopcal.measure.kinds.distance import Distance
 from loopcal.measure.kinds.position import Position
@@ -115,6 +116,30 @@ def test_sessions_get_separate_start_values():
     assert_allclose(
         whitened_residuals(data, T, local, guess_nuisance_values(data, T, local)), 0.0, atol=1e-3
     )
+
+
+@pytest.mark.parametrize("name", ["targets in a frame", "a frame"])
+def test_start_values_of_all_sessions_are_sought_together(name, monkeypatch):
+    rng = np.random.default_rng(1)
+    T = poses(rng)
+    _, local, truth = simulate_rows(KINDS[name], T, rng)
+    kind = KINDS[name].with_tool(np.eye(4))
+    values = truth + rng.normal(0.0, 0.3, (6, len(local)))  # of six sessions, five poses each
+    session = np.repeat([f"s{i}" for i in range(6)], 5)
+    no_noise = np.zeros((1, N, len(kind.noise_columns)))
+    measured = kind.measure(T[None], no_noise, values[np.repeat(np.arange(6), 5)][None])[0]
+    measured[7] = np.nan  # a session with fewer rows
+    rows = Observations.from_sigma(kind, np.arange(N), measured, 1e-5, session=session)
+    data = Measurements("toy", np.zeros((N, 1)), (rows,))
+    calls = []
+    minimize = initial_values.minimize_from_starts
+    monkeypatch.setattr(
+        initial_values, "minimize_from_starts", lambda *a: (calls.append(0), minimize(*a))[1]
+    )
+    nuisance = data.nuisance_parameters
+    found = guess_nuisance_values_batch(data, [rows.measured[None]], T[None], nuisance)[0]
+    assert len(calls) <= 2  # sessions with about as many rows
+    assert_allclose(whitened_residuals(data, T, nuisance, found), 0.0, atol=1e-3)
 
 
 def test_fixed_values_are_kept_and_priors_change_start_values():

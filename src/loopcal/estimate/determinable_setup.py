@@ -151,19 +151,22 @@ def _find_undetermined(robot: Mechanism, data: Measurements, T: FloatArray) -> l
                 others.add(owner)
             else:
                 columns[owner].append((i, rows, places))
-    workspace: FloatArray | None = None
+    parts = [_linearize_setup(rows, T) for rows in data.all_observations]
+    has_workspace = False
     names: list[str] = []
     table = data.nuisance_parameters.table
     for owner in (owner for owner in columns if owner not in others):
         used = columns[owner]
-        if not _choose_fixed(robot, used, T):
-            continue
-        if workspace is None:
+        axes = _choose_fixed(robot, used, parts)
+        if axes and not has_workspace:
             try:
                 workspace = sample_workspace(robot, POSES).solution.T
             except MechanismError:  # no stated workspace
                 return []
-        axes = _choose_fixed(robot, used, np.concatenate([T, workspace]))
+            more = (_linearize_setup(rows, workspace) for rows in data.all_observations)
+            parts = [np.concatenate(of_kind) for of_kind in zip(parts, more, strict=True)]
+            has_workspace = True
+            axes = _choose_fixed(robot, used, parts)
         for i, _, places in used:
             for axis in (axis for axis in AXES if axis in axes and axis in places):
                 entered = find_distinct(data.nuisance_parameters.indices[i][:, places[axis]])
@@ -184,28 +187,39 @@ def _list_places(rows: Observations) -> dict[str, dict[str, int]]:
     return owners
 
 
+def _linearize_setup(rows: Observations, T: FloatArray) -> FloatArray:
+    """Return derivatives (n m, u) of one row at poses (n, 4, 4), whitened as the most complete one,
+    by its setup parameters; none where it has none or compares poses.
+    """
+    kind = rows.kind
+    if kind.poses_per_row > 1 or kind.of or kind.sensed_joints or not kind.nuisance_parameters:
+        return np.zeros((0, len(kind.nuisance_parameters)))
+    best = int(np.argmax(rows.present.sum(axis=1)))
+    noise = np.zeros((1, len(T), len(kind.noise_columns)))
+    by_setup = kind.evaluate(T[None], kind.measure(T[None], noise), kind.nominal_values[None, None])
+    u = len(kind.nuisance_parameters)
+    if by_setup.nuisance is None:
+        return np.zeros((0, u))
+    return (rows.whitener[best] @ by_setup.nuisance[0]).reshape(-1, u)
+
+
 def _choose_fixed(
-    robot: Mechanism, used: list[tuple[int, Observations, dict[str, int]]], T: FloatArray
+    robot: Mechanism, used: list[tuple[int, Observations, dict[str, int]]], parts: list[FloatArray]
 ) -> set[str]:
-    """Return the axes of an item to fix so that no combination is without effect at poses
-    (n, 4, 4); none where rotations that act are not about axes of the base.
+    """Return the axes of an item to fix so that no combination is without effect, from derivatives
+    of every kind (`_linearize_setup`); none where rotations that act are not about axes of the
+    base.
     """
     present = [axis for axis in AXES if any(axis in places for _, _, places in used)]
     unit = np.array([1.0 / robot.size if axis in ROTATION_AXES else 1.0 for axis in present])
     blocks = []
-    for _, rows, places in used:
-        kind, values = rows.kind, rows.kind.nominal_values[None, None]
-        best = int(np.argmax(rows.present.sum(axis=1)))
-        noise = np.zeros((1, len(T), len(kind.noise_columns)))
-        by_setup = kind.evaluate(T[None], kind.measure(T[None], noise), values).nuisance
-        if by_setup is None:
-            continue
-        whitened = (rows.whitener[best] @ by_setup[0]).reshape(-1, by_setup.shape[-1])
-        block = np.zeros((len(whitened), len(present)))
+    for i, _, places in used:
+        block = np.zeros((len(parts[i]), len(present)))
         for axis, place in places.items():
-            block[:, present.index(axis)] = whitened[:, place]
+            block[:, present.index(axis)] = parts[i][:, place]
         blocks.append(block * unit)
-    _, s, vt = np.linalg.svd(np.concatenate([*blocks, np.zeros((len(present), len(present)))]))
+    rows = np.concatenate([*blocks, np.zeros((len(present), len(present)))])
+    _, s, vt = np.linalg.svd(np.linalg.qr(rows, mode="r"))
     null = vt[s <= NO_EFFECT * s[0]].T
     if not null.shape[1] or s[0] == 0.0:  # an item that was never measured is no matter of motion
         return set()

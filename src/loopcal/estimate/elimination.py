@@ -11,7 +11,7 @@ nuisance parameter is one more row. See docs/theory/identification.md.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -20,10 +20,7 @@ from loopcal import engine
 from loopcal.estimate.linearization import KindRows
 from loopcal.estimate.observation_rows import ObservationRows
 from loopcal.frozen_dataclass import dataclass, replace
-from loopcal.measure.initial_values import guess_nuisance_values
-from loopcal.measure.measurements import Measurements
 from loopcal.measure.nuisance import NuisanceParameters
-from loopcal.measure.observations import Observations
 from loopcal.numerics.elimination import (
     EliminationTree,
     NodeFactors,
@@ -33,7 +30,6 @@ from loopcal.numerics.elimination import (
 )
 from loopcal.numerics.statistics import find_distinct
 from loopcal.numerics.trial_batch import TrialBatch
-from loopcal.parameters import ParameterTable
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
 
@@ -120,56 +116,6 @@ class NuisanceElimination:
         if len(self.prior_mean) == 1:
             return self
         return replace(self, prior_mean=self.prior_mean[trials])
-
-    def start_values(
-        self, data: Measurements, T: FloatArray, joints: Mapping[str, FloatArray]
-    ) -> FloatArray:
-        """Return values (U,) that fit measurements at poses T (n, 4, 4), cluster by cluster.
-
-        `joints` : name -> (1, n) [SI].
-        """
-        values = self.local.values()
-        kinds = [
-            (o, i, self.tree.cluster[places].max(axis=1, initial=-1))
-            for i, (o, places) in enumerate(
-                zip(data.all_observations, self.local.indices, strict=True)
-            )
-            if len(o) and places.shape[1]
-        ]
-        for c in range(int(self.tree.cluster.max(initial=-1)) + 1):
-            chosen = [
-                (o.take(cluster == c), i, cluster == c)
-                for o, i, cluster in kinds
-                if (cluster == c).any()
-            ]
-            self._seek(values, data, chosen, T, joints)
-        return values
-
-    def _seek(
-        self,
-        values: FloatArray,
-        data: Measurements,
-        chosen: list[tuple[Observations, int, BoolArray]],
-        T: FloatArray,
-        joints: Mapping[str, FloatArray],
-    ) -> None:
-        """Write the start values of one cluster into values (U,): chosen are its rows, the number
-        of their kind, and which of its rows (r,) they are.
-        """
-        places_by_kind = [self.local.indices[i][members] for _, i, members in chosen]
-        factors = [(self.local.factor(i), members) for _, i, members in chosen]
-        used = find_distinct(np.concatenate([places.ravel() for places in places_by_kind]))
-        setup = NuisanceParameters(
-            ParameterTable(tuple(self.local.table.entries[i] for i in used)),
-            tuple(np.searchsorted(used, places) for places in places_by_kind),
-            tuple(None if factor is None else factor[members] for factor, members in factors),
-        )
-        part = replace(
-            data,
-            observations=tuple(rows for rows, _, _ in chosen if not rows.kind.is_of_base),
-            base_observations=tuple(rows for rows, _, _ in chosen if rows.kind.is_of_base),
-        )
-        values[used] = guess_nuisance_values(part, T, setup, joints)
 
     def keep_apart(
         self, parameters: int, nodes: IntArray

@@ -56,6 +56,7 @@ from loopcal.estimate.pose_coordinates import (
 )
 from loopcal.estimate.pose_rows import BLOCK, PoseBlock, PoseRows, find_components
 from loopcal.frozen_dataclass import dataclass, replace
+from loopcal.measure.initial_values import guess_nuisance_values_batch
 from loopcal.measure.kinds.kind import Evaluation, Kind
 from loopcal.measure.measurements import Measurements, anchor_rows
 from loopcal.measure.nuisance import NuisanceParameters
@@ -311,7 +312,11 @@ class Problem:
             located = self.poses.locate(deviation[trial], start.take(trial))
             if located is not None:
                 data = self.data(int(self.trials[i]))
-                return start.with_nuisance(self.nuisance.start_values(data, *located))
+                measured = [rows.measured[None] for rows in data.all_observations]
+                # by groups of rows; the fit begins with the best values of all rows together
+                local = self.nuisance.local
+                found = guess_nuisance_values_batch(data, measured, located[0][None], local)
+                return start.with_nuisance(found)
         return start
 
     def linearize(self, deviation: FloatArray, start: Start) -> Linearization:

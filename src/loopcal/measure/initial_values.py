@@ -9,19 +9,24 @@ values.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from loopcal.errors import DataError
+from loopcal.frozen_dataclass import replace
 from loopcal.measure.kinds.kind import Kind
 from loopcal.measure.kinds.position import Position
 from loopcal.measure.kinds.setup_parameters import shorten_rotations
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.nuisance import NuisanceParameters
 from loopcal.measure.observations import Observations
+from loopcal.numerics.elimination import find_connected_groups
 from loopcal.numerics.gauss_newton import STEPS, minimize_from_starts, sum_squares
+from loopcal.numerics.statistics import find_distinct
+from loopcal.parameters import ParameterTable
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
 ALIKE = 1.0
@@ -152,20 +157,15 @@ def guess_nuisance_values_batch(
     T : (t | 1, n, 4, 4) T_base_platform.
     most : number of candidates of each set to refine, those with the lowest cost; default all.
     """
-    known = ~(nuisance.table.free & np.isnan(nuisance.table.tolerance))
     observations = measurements.all_observations
     sets = max((len(m) for m in measured), default=len(T))
     values = np.tile(nuisance.values(), (sets, 1))
-    for i, members, indices in _list_groups(measurements, nuisance):
-        # a drift begins at zero: every row takes another part of it
-        is_kept = known[indices] | observations[i].kind.is_drift
-        if is_kept.all():
-            continue
-        chosen = observations[i].take(members)
-        given = (measured[i][:, members], T[:, chosen.rows], values[:, indices], is_kept)
-        refined, cost = _refine_candidates(chosen, *given, most, steps)
-        values[:, indices] = refined[np.arange(len(refined)), np.argmin(cost, axis=1)]
-        known[indices] = True
+    for groups in _list_groups(measurements, nuisance):
+        rows = observations[groups.number]
+        given = (measured[groups.number], T, values[:, groups.parameters])
+        refined, cost = _refine_candidates(rows, groups, *given, most, steps)
+        best = np.argmin(cost, axis=2)[..., None, None]
+        values[:, groups.parameters] = np.take_along_axis(refined, best, axis=2)[:, :, 0]
     return values
 
 
@@ -174,40 +174,59 @@ def find_equal_values(
 ) -> FloatArray:
     """Return other values (k, U) of the nuisance parameters that fit all measurements at poses
     (n, 4, 4) as well as given ones (U,), up to `ALIKE`; fixed ones and those with a prior stay.
+
+    Each of them changes the parameters of every cluster on its own.
     """
-    known = ~(nuisance.table.free & np.isnan(nuisance.table.tolerance))
-    observations = measurements.all_observations
-    others = [values]
-    for i, members, indices in _list_groups(measurements, nuisance):
-        is_kept = known[indices] | observations[i].kind.is_drift
-        if not is_kept.all():
-            chosen = observations[i].take(members)
-            given = (chosen.measured[None], T[None, chosen.rows], values[None, indices], is_kept)
-            try:
-                refined = _refine_candidates(chosen, *given)[0][0]
-            except DataError:  # too few rows for candidates
-                continue
-            for candidate in refined:
-                other = values.copy()
-                other[indices] = candidate
-                others.append(other)
-    tested = np.array(others)
-    evaluated = evaluate_measurements(measurements, T[None], tested, nuisance)
-    rows = whiten_rows(evaluated, np.zeros((1, len(T), 6, 0)))
-    cost = sum_squares(rows[..., -1])
-    return tested[1:][cost[1:] <= cost[0] + ALIKE]
+    observations, cluster = measurements.all_observations, _find_clusters(nuisance)
+    others = values[None]
+    used = np.ones(int(cluster.max(initial=-1)) + 1, dtype=np.int64)  # values of each cluster
+    for groups in _list_groups(measurements, nuisance, is_alone=True):
+        rows = observations[groups.number]
+        given = (rows.measured[None], T[None], values[None, groups.parameters])
+        try:
+            refined = _refine_candidates(rows, groups, *given)[0][0]
+        except DataError:  # too few rows for candidates
+            continue
+        for own, candidates in zip(groups.parameters, refined, strict=True):
+            c = cluster[own].max()
+            places = used[c] + np.arange(len(candidates))
+            used[c] += len(candidates)
+            more = max(int(used[c]) - len(others), 0)
+            others = np.concatenate([others, np.tile(values, (more, 1))])
+            others[places[:, None], own] = candidates
+    cost = np.zeros((len(others), len(used)))
+    for i, rows in enumerate(observations):
+        if len(rows) and nuisance.indices[i].shape[1]:
+            residual = rows.evaluate(T[None], nuisance.select(i, others)).residual
+            square = ((rows.whitener @ residual[..., None]) ** 2).sum(axis=(2, 3))
+            of = cluster[nuisance.indices[i]].max(axis=1)
+            np.add.at(cost.T, of[of >= 0], square.T[of >= 0])
+    is_equal = np.isfinite(cost) & (cost <= cost[0] + ALIKE)
+    kept = (cluster >= 0) & is_equal[:, cluster]
+    return np.where(kept, others, values)[1:]
+
+
+class _Groups(NamedTuple):
+    """g groups of rows of one kind, each of which shares its parameters."""
+
+    number: int  # of the observations
+    # (g, r) their rows, the first one again in place of missing ones, and which are none
+    rows: IntArray
+    is_row: BoolArray
+    parameters: IntArray  # (g, u)
+    is_kept: BoolArray  # (u,) parameters that keep their values
 
 
 def _list_groups(
-    measurements: Measurements, nuisance: NuisanceParameters
-) -> list[tuple[int, IntArray, IntArray]]:
-    """Return the groups of rows that use the same parameters: number of the observations, indices
-    of its rows that measured something, and the parameters.
+    measurements: Measurements, nuisance: NuisanceParameters, *, is_alone: bool = False
+) -> Iterator[_Groups]:
+    """Give the groups of rows that use the same parameters, of which some are to be found, those of
+    one kind with about as many rows together.
 
     They are in the order of the observations. Of the same kind, the group with the most rows is
-    first, so that a file with few rows does not determine the parameters that it shares. Targets on
-    the base whose stated places determine a frame are before all others, since no pose is needed;
-    other targets on the base are last.
+    first, so that a file with few rows does not determine the parameters that it shares, which a
+    later group keeps unless each `is_alone`. Targets on the base whose stated places determine a
+    frame are before all others, since no pose is needed; other targets on the base are last.
     """
 
     def rank(kind: Kind) -> int:
@@ -215,80 +234,128 @@ def _list_groups(
             return 0
         return 2 if kind.is_of_base else 1
 
-    kinds = [(rank(rows.kind), type(rows.kind)) for rows in measurements.all_observations]
-    groups = []
-    for i, rows in enumerate(measurements.all_observations):
+    known = ~(nuisance.table.free & np.isnan(nuisance.table.tolerance))
+    observations = measurements.all_observations
+    kinds = [(rank(rows.kind), type(rows.kind)) for rows in observations]
+    listed: list[tuple[int, IntArray, IntArray]] = []
+    for i, rows in enumerate(observations):
         if not rows.kind.nuisance_parameters or rows.kind.sensed_joints:
             continue
-        counts = (rows.weight > 0.0) & rows.present.any(axis=1)
-        sets, member = np.unique(nuisance.indices[i], axis=0, return_inverse=True)
-        for k, indices in enumerate(sets):
-            counted = np.flatnonzero((member.ravel() == k) & counts)
-            if len(counted):
-                groups.append((i, counted, indices))
-    return sorted(
-        groups, key=lambda group: (kinds[group[0]][0], kinds.index(kinds[group[0]]), -len(group[1]))
-    )
+        counts = np.flatnonzero((rows.weight > 0.0) & rows.present.any(axis=1))
+        sets, member = np.unique(nuisance.indices[i][counts], axis=0, return_inverse=True)
+        order = np.argsort(member.ravel(), kind="stable")
+        ends = np.cumsum(np.bincount(member.ravel(), minlength=len(sets)))[:-1]
+        parts = np.split(counts[order], ends) if len(sets) else []
+        listed += [(i, own, indices) for own, indices in zip(parts, sets, strict=True)]
+    listed.sort(key=lambda g: (kinds[g[0]][0], kinds.index(kinds[g[0]]), -len(g[1])))
+    # a group comes in a later turn than those before it with which it shares an unknown parameter
+    turn, turns = np.zeros(len(known), dtype=np.int64), defaultdict(list)
+    for group in listed:
+        own = group[2][~known[group[2]]]
+        now = 0 if is_alone else int(turn[own].max(initial=0))
+        turn[own] = now + 1
+        turns[now].append(group)
+    for _, together in sorted(turns.items()):
+        alike = defaultdict(list)
+        for group in together:
+            i, own, indices = group
+            # a drift begins at zero: every row takes another part of it
+            is_kept = known[indices] | observations[i].kind.is_drift
+            if not is_kept.all():
+                alike[i, tuple(is_kept), len(own).bit_length()].append(group)
+        for (i, is_kept, _), groups in alike.items():
+            count = np.array([len(own) for _, own, _ in groups])
+            rows = np.array([np.resize(own, count.max()) for _, own, _ in groups])
+            is_row = np.arange(count.max()) < count[:, None]
+            parameters = np.array([indices for *_, indices in groups])
+            yield _Groups(i, rows, is_row, parameters, np.array(is_kept))
+        if not is_alone:
+            for *_, indices in together:
+                known[indices] = True
+
+
+def _find_clusters(nuisance: NuisanceParameters) -> IntArray:
+    """Return the cluster (U,) of each free parameter, -1 for others; rows join its parameters."""
+    free, links = nuisance.table.free, [np.zeros((0, 2), dtype=np.int64)]
+    for used in nuisance.indices:
+        if used.shape[1]:
+            first = np.take_along_axis(used, np.argmax(free[used], axis=1)[:, None], axis=1)
+            pairs = np.stack([np.broadcast_to(first, used.shape), used], axis=-1)
+            links.append(pairs[free[used]].reshape(-1, 2))
+    cluster = np.full(len(free), -1)
+    joined = find_connected_groups(np.unique(np.concatenate(links), axis=0), len(free))
+    cluster[free] = np.unique(joined[free], return_inverse=True)[1]
+    return cluster
 
 
 def _refine_candidates(
     rows: Observations,
+    groups: _Groups,
     measured: FloatArray,
-    poses: FloatArray,
+    T: FloatArray,
     values: FloatArray,
-    known: BoolArray,
     most: int | None = None,
     steps: int = STEPS,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return refined candidates (t, k, u) for rows that share their parameters, and their sums of
-    squares (t, k); known parameters keep their values (t, u).
+    """Return refined candidates (t, g, k, u) of groups for t sets of measured values (t, r, c) at
+    poses (t | 1, n, 4, 4), and their sums of squares (t, g, k); kept parameters keep their values
+    (t, g, u).
     """
-    kind, t = rows.kind, len(measured)
-    candidates = _collect_candidates(kind, poses, measured, bool(known.any()))
-    k = candidates.shape[1]
-    candidates = np.where(known, values[:, None, :], candidates).reshape(t * k, -1)
+    kind, t, (g, r) = rows.kind, len(measured), groups.rows.shape
+
+    def spread(array: np.ndarray) -> np.ndarray:
+        """Return arrays (s | 1, ..) of the groups in each of t sets from (t | 1, g, ..)."""
+        if g > 1:
+            array = np.broadcast_to(array, (t, *array.shape[1:]))
+        return array.reshape(-1, *array.shape[2:])
+
+    poses, columns = spread(T[:, rows.rows[groups.rows]]), spread(measured[:, groups.rows])
+    whitener = spread((rows.whitener[groups.rows] * groups.is_row[..., None, None])[None])
+    is_row, kept = spread(groups.is_row[None]), groups.is_kept
+    is_strict = t == 1 and not kept.any()
+    candidates = _collect_candidates(kind, poses, columns, is_row, is_strict)
+    k, own = candidates.shape[1], values.reshape(t * g, 1, -1)
+    candidates = np.where(kept, own, candidates).reshape(t * g * k, -1)
 
     def whiten(x: FloatArray, sets: IntArray) -> tuple[FloatArray, FloatArray]:
-        evaluated = kind.evaluate(
-            poses[sets if len(poses) > 1 else [0]], measured[sets if t > 1 else [0]], x[:, None, :]
-        )
-        c, r, m = len(x), *evaluated.residual.shape[1:]
+        at, seen, white = (a[sets] if len(a) > 1 else a for a in (poses, columns, whitener))
+        evaluated = kind.evaluate(at, seen, x[:, None, :])
+        c, m = len(x), evaluated.residual.shape[2]
         by_nuisance = evaluated.nuisance
         slopes = np.zeros((1, 1, 1, x.shape[1])) if by_nuisance is None else by_nuisance
-        J = rows.whitener @ np.broadcast_to(slopes, (c, r, m, x.shape[1]))
-        e = (rows.whitener @ np.broadcast_to(evaluated.residual, (c, r, m))[..., None])[..., 0]
-        return e.reshape(c, -1), np.where(known, 0.0, J).reshape(c, r * m, -1)
+        J = white @ np.broadcast_to(slopes, (c, r, m, x.shape[1]))
+        e = (white @ np.broadcast_to(evaluated.residual, (c, r, m))[..., None])[..., 0]
+        return e.reshape(c, -1), np.where(kept, 0.0, J).reshape(c, r * m, -1)
 
-    sets = np.repeat(np.arange(t), k)
+    sets = np.repeat(np.arange(t * g), k)
     if most is not None and most < k:
-        cost = sum_squares(whiten(candidates, sets)[0]).reshape(t, k)
-        chosen = (np.argsort(cost, axis=1)[:, :most] + k * np.arange(t)[:, None]).ravel()
+        cost = sum_squares(whiten(candidates, sets)[0]).reshape(t * g, k)
+        chosen = (np.argsort(cost, axis=1)[:, :most] + k * np.arange(t * g)[:, None]).ravel()
         candidates, sets, k = candidates[chosen], sets[chosen], most
     refined, cost = minimize_from_starts(lambda x, which: whiten(x, sets[which]), candidates, steps)
     names = [parameter.name for parameter in kind.nuisance_parameters]
     shortest = shorten_rotations(names, refined)
-    is_kept = ((shortest == refined) | ~known).all(axis=1, keepdims=True)
-    return np.where(is_kept, shortest, refined).reshape(t, k, -1), cost.reshape(t, k)
+    is_same = ((shortest == refined) | ~kept).all(axis=1, keepdims=True)
+    return np.where(is_same, shortest, refined).reshape(t, g, k, -1), cost.reshape(t, g, k)
 
 
 def _collect_candidates(
-    kind: Kind, poses: FloatArray, measured: FloatArray, is_partly_known: bool
+    kind: Kind, poses: FloatArray, measured: FloatArray, is_row: BoolArray, is_strict: bool
 ) -> FloatArray:
-    """Return the candidates of a kind for each set of measured values, the nominal values last, (t,
-    k, u). Data that leave some parameters open may do for the others, if any are known.
+    """Return the candidates of a kind for each set of measured values, the nominal values last, (s,
+    k, u). Data that leave some parameters open may do for the others: without a closed form,
+    frames are spread unless this `is_strict`.
     """
-    offered = []
-    for j, of_set in enumerate(measured):
-        try:
-            own = kind.without_shared_errors() if kind.shared_errors else kind
-            guesses = own.guess_values(poses[j if len(poses) > 1 else 0], of_set)
+    offered, own = [], kind.without_shared_errors() if kind.shared_errors else kind
+    for guesses in own.guess_sets(poses, measured, is_row):
+        if not isinstance(guesses, DataError):
             shared = len(kind.nominal_values) - guesses.shape[1]  # a bias or drift begins at zero
-            guesses = np.pad(guesses, ((0, 0), (0, shared)))
-        except DataError:
-            if len(measured) == 1 and not is_partly_known:
-                raise
-            guesses = kind.spread_frames()
-        offered.append(np.concatenate([guesses, kind.nominal_values[None]]))
+            candidates = np.pad(guesses, ((0, 0), (0, shared)))
+        elif is_strict:
+            raise guesses
+        else:
+            candidates = kind.spread_frames()
+        offered.append(np.concatenate([candidates, kind.nominal_values[None]]))
     k = max(len(guesses) for guesses in offered)
     return np.stack([np.concatenate([g, np.repeat(g[-1:], k - len(g), axis=0)]) for g in offered])
 
@@ -300,7 +367,41 @@ def _refine_together(
     values: FloatArray,
     joints: Mapping[str, FloatArray] | None,
 ) -> FloatArray:
-    """Return values (U,) after a descent over all parameters and all rows, priors included."""
+    """Return values (U,) after a descent over all parameters and all rows, priors included, of one
+    cluster after the other.
+    """
+    cluster, refined = _find_clusters(nuisance), values.copy()
+    members = [cluster[used].max(axis=1, initial=-1) for used in nuisance.indices]
+    for c in range(int(cluster.max(initial=-1)) + 1):
+        listed: dict[bool, list[Observations]] = {False: [], True: []}
+        places, factors = [], []
+        for i, (rows, member) in enumerate(
+            zip(measurements.all_observations, members, strict=True)
+        ):
+            chosen, factor = np.flatnonzero(member == c), nuisance.factor(i)
+            if len(chosen):
+                listed[rows.kind.is_of_base].append(rows.take(chosen))
+                places.append(nuisance.indices[i][chosen])
+                factors.append(None if factor is None else factor[chosen])
+        used = find_distinct(np.concatenate([array.ravel() for array in places]))
+        entries = tuple(nuisance.table.entries[i] for i in used)
+        own = tuple(np.searchsorted(used, array) for array in places)
+        part = replace(
+            measurements, observations=tuple(listed[False]), base_observations=tuple(listed[True])
+        )
+        local = NuisanceParameters(ParameterTable(entries), own, tuple(factors))
+        refined[used] = _refine_cluster(part, T, local, values[used], joints)
+    return refined
+
+
+def _refine_cluster(
+    measurements: Measurements,
+    T: FloatArray,
+    nuisance: NuisanceParameters,
+    values: FloatArray,
+    joints: Mapping[str, FloatArray] | None,
+) -> FloatArray:
+    """Return values (U,) of the parameters of one cluster after a descent from given ones."""
     no_motion = np.zeros((1, len(T), 6, 0))
     weight = np.where(nuisance.table.free, 1.0 / nuisance.table.tolerance, 0.0)
     prior = np.diag(np.nan_to_num(weight, nan=0.0))

@@ -502,6 +502,22 @@ class Kind(ABC):
         del T, measured
         return self.nominal_values[None]
 
+    def guess_sets(
+        self, T: FloatArray, measured: FloatArray, is_row: BoolArray
+    ) -> list[FloatArray | DataError]:
+        """Return the candidates (k, u) of `guess_values` for s sets of rows with parameters of
+        their own, or why there are none, from poses T (s | 1, r, 4, 4) and columns (s, r, c) of
+        those that a set has, `is_row` (s | 1, r).
+        """
+        guesses: list[FloatArray | DataError] = []
+        for j, of_set in enumerate(measured):
+            own = is_row[j if len(is_row) > 1 else 0]
+            try:
+                guesses.append(self.guess_values(T[j if len(T) > 1 else 0][own], of_set[own]))
+            except DataError as error:
+                guesses.append(error)
+        return guesses
+
     def detect_present(self, measured: FloatArray) -> BoolArray:
         """Return which residuals (..., m) exist for columns (..., c); NaN is not measured."""
         return ~np.isnan(measured)

@@ -34,7 +34,7 @@ from loopcal.measure.kinds.kind import (
     checked,
     make_angles,
 )
-from loopcal.typing import FloatArray
+from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import Dimension
 
 # The g columns of each target (.., k, g), their derivatives (.., k, g, 3) by its coordinates in the
@@ -288,24 +288,59 @@ class Position(TargetKind):
                 return self.nominal_values[None]
             frame = align_point_sets(positions, points)
             return self.assemble_values({"frame": setup.encode_frame(self.T_base_frame, frame)})
+        if {"frame", "targets"} <= set(self.unknown):
+            guess = self.guess_sets(T[None], measured[None], np.ones((1, len(T)), dtype=bool))[0]
+            if isinstance(guess, DataError):
+                raise guess
+            return guess
         moving, origin, points, positions = self.collect_points(T, measured)
         if not self.unknown or len(positions) < 3:
             return self.nominal_values[None]
+        if "frame" in self.unknown:
+            self._check_extent(positions)
+        if "targets" not in self.unknown:
+            return setup.encode_frame(self.T_base_frame, align_point_sets(positions, points))[None]
+        base = positions @ self.T_base_frame[:3, :3].T + self.T_base_frame[:3, 3]
+        return solve_least_squares(moving.reshape(base.size, -1), (base - origin).ravel())[None]
+
+    def guess_sets(
+        self, T: FloatArray, measured: FloatArray, is_row: BoolArray
+    ) -> list[FloatArray | DataError]:
+        """Return the candidates of each set; frames with targets of all sets are found together."""
+        if self.is_of_base or not {"frame", "targets"} <= set(self.unknown):
+            return super().guess_sets(T, measured, is_row)
+        (s, r), k = measured.shape[:2], len(self.targets)
+        positions = np.where(is_row[..., None], measured, np.nan).reshape(s, r * k, 3)
+        guesses: list[FloatArray | DataError] = [self.nominal_values[None]] * s
+        chosen = []
+        for j, of_set in enumerate(positions):
+            complete = of_set[~np.isnan(of_set).any(axis=1)]
+            if len(complete) >= 3:
+                try:
+                    self._check_extent(complete)
+                    chosen.append(j)
+                except DataError as error:
+                    guesses[j] = error
+        if chosen:
+            own = np.broadcast_to(T, (s, *T.shape[1:]))[chosen]
+            moving = own[:, :, None, :3, None, :3] * np.eye(k)[:, None, :, None]
+            moving = moving.reshape(len(chosen), r * k, 3, 3 * k)
+            origin = np.repeat(own[:, :, :3, 3], k, axis=1)
+            solved = solve_frame_and_points(positions[chosen], moving, origin)
+            for j, (frames, places) in zip(chosen, solved, strict=True):
+                items = {"frame": setup.encode_frame(self.T_base_frame, frames), "targets": places}
+                guesses[j] = self.assemble_values(items)
+        return guesses
+
+    def _check_extent(self, positions: FloatArray) -> None:
+        """Refuse positions (q, 3) from which an unknown frame does not follow."""
         extent = np.linalg.svd(positions - positions.mean(axis=0), compute_uv=False)
-        if "frame" in self.unknown and extent[1] <= FLATNESS * extent[0]:
+        if extent[1] <= FLATNESS * extent[0]:
             raise DataError(
                 f"the {len(positions)} positions are collinear, so the rotation of the frame "
                 f"{self.frame!r} about their line is not determined. Measure poses off the "
                 f"line, or give a known T_base_frame"
             )
-        if "targets" not in self.unknown:
-            return setup.encode_frame(self.T_base_frame, align_point_sets(positions, points))[None]
-        if "frame" in self.unknown:
-            frames, places = solve_frame_and_points(positions, moving, origin)
-            items = {"frame": setup.encode_frame(self.T_base_frame, frames), "targets": places}
-            return self.assemble_values(items)
-        base = positions @ self.T_base_frame[:3, :3].T + self.T_base_frame[:3, 3]
-        return solve_least_squares(moving.reshape(base.size, -1), (base - origin).ravel())[None]
 
     @property
     def locates_frame(self) -> bool:
