@@ -10,11 +10,13 @@ are removed once, by a stated tolerance, for all designs alike. See docs/theory/
 from __future__ import annotations
 
 from functools import cached_property
+from math import prod
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from loopcal import engine
 from loopcal.errors import EstimationError
 from loopcal.findings import report_finding
 from loopcal.frozen_dataclass import dataclass, replace
@@ -28,14 +30,19 @@ SINGULAR = 1e-6
 
 
 def factor_rows(rows: FloatArray) -> FloatArray:
-    """Return the triangular factor R of rows (m, c), at most (c, c): R'R is their information."""
-    return np.asarray(np.linalg.qr(rows, mode="r"))
+    """Return rows R (.., c, c) with the information R'R of rows (.., m, c), triangular; fewer than
+    c rows as they are.
+    """
+    *shape, m, c = rows.shape
+    if m < c:
+        return rows
+    R = engine.fold(np.zeros((prod(shape), c, c)), rows.reshape(prod(shape), m, c))
+    return R.reshape(*shape, c, c)
 
 
 def factor_square(rows: FloatArray) -> FloatArray:
     """Return the factor of rows (m, c) with rows of zeros below where m < c, (c, c)."""
-    R = factor_rows(rows)
-    return np.concatenate([R, np.zeros((R.shape[1] - len(R), R.shape[1]))])
+    return engine.fold(np.zeros((1, rows.shape[1], rows.shape[1])), rows[None])[0]
 
 
 def divide_by_factor(rows: FloatArray, R: FloatArray) -> FloatArray:

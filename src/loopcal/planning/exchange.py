@@ -251,7 +251,7 @@ def differentiate_score(
 def _multiply_pairs(Y: FloatArray, V: FloatArray) -> FloatArray:
     """Return <Y_i Y_k', V_i V_k'> = <Y_i' V_i, Y_k' V_k> (s, s) of rows (s, r, Q) and (s, r, q)."""
     s, r, q = V.shape
-    if r * r > q:
+    if 2 * r * r > q:  # fewer operations
         products = (Y.swapaxes(1, 2) @ V).reshape(s, -1)
         return products @ products.T
     # row by row of the groups, so that the sum runs over whole matrices (s, s)
@@ -274,6 +274,7 @@ PERTURBED = 0.15  # share of the groups that a perturbation replaces; at least t
 AMONG, FEWEST = 6, 100
 CURVE_PERTURBATIONS = 10  # number of perturbations of each design of a curve
 SINGULAR_EXCESS = 1.0 + 1e-9  # excess of a size without a regular design: the next is a step larger
+ROUNDING = 1e-12  # excess that meets a target: the rounding of a criterion
 BOUND_GAP = 3e-3  # gap of the relaxation where only the size is needed
 
 
@@ -544,7 +545,7 @@ def search_size(excess: Callable[[int], float], low: int, high: int) -> int:
     failed, met, size, step, halve = low - 1, high + 1, low, 1, False
     while failed + 1 < met:
         times = excess(size)
-        failed, met = (failed, size) if times <= 1.0 else (size, met)
+        failed, met = (failed, size) if times <= 1.0 + ROUNDING else (size, met)
         guess = np.ceil(size * times)
         if met > high:
             guess, step = min(max(guess, size + step), 2 * size), 2 * step
