@@ -6,6 +6,7 @@ need no masked arrays.
 
 import subprocess
 import sys
+import warnings
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from loopcal.numerics.statistics import (
     compute_chi_square_quantile,
     compute_chi_square_tail,
     compute_component_tail,
+    compute_known_median,
     compute_median,
     compute_weighted_quantile,
     estimate_variance_component,
@@ -134,6 +136,16 @@ def test_distinct_values_are_those_of_numpy(values) -> None:
 )
 def test_the_median_is_that_of_numpy_to_the_last_bit(values) -> None:
     np.testing.assert_array_equal(compute_median(np.array(values)), np.median(values))
+
+
+def test_the_median_of_known_values_is_that_of_numpy() -> None:
+    values = np.random.default_rng(0).normal(size=(7, 6))
+    values[0] = values[:3, 1] = values[1, 2] = np.nan
+    for axis in (0, 1):
+        with np.errstate(invalid="ignore"), warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)  # of a row without values
+            expected = np.nanmedian(values, axis=axis)
+        np.testing.assert_array_equal(compute_known_median(values, axis), expected)
 
 
 def test_masked_arrays_are_not_imported() -> None:

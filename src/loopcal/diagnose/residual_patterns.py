@@ -33,6 +33,7 @@ from loopcal.measure.kinds.kind import Kind, list_components
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations
 from loopcal.mechanism.model import Mechanism
+from loopcal.numerics.distributions import beta_probability
 from loopcal.numerics.statistics import (
     Remainder,
     VarianceComponent,
@@ -532,10 +533,8 @@ def test_correlation(rows: ResidualRows) -> tuple[float, float]:
     total = center * (1.0 - center) / (0.25 * variance) - 1.0
     if not total > 0.0:
         return observed - mean, np.nan
-    from scipy.special import betainc
-
     place = float(np.clip(0.5 * (1.0 - observed), 0.0, 1.0))
-    return observed - mean, float(betainc((1.0 - center) * total, center * total, place))
+    return observed - mean, float(beta_probability((1.0 - center) * total, center * total, place))
 
 
 # The covariance of a fit whose errors are correlated in the order of measurement.

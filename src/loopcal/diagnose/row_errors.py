@@ -36,6 +36,7 @@ from loopcal.measure.readings import list_sensed_joints, select_joint_values
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import read_coordinates
 from loopcal.mechanism.solutions import Solution, inverse, make_solution
+from loopcal.numerics.distributions import student_probability
 from loopcal.numerics.statistics import NEAR_ONE, compute_chi_square_tail, invert_increasing
 from loopcal.numerics.trial_batch import map_arrays
 from loopcal.parameters import ParameterTable
@@ -269,8 +270,6 @@ class KindErrors:
             none, the part of b that is orthogonal to d is the noise: equal for both geometries.
         values : measured values that are left to check the geometry.
         """
-        from scipy.special import stdtr
-
         scale, degrees = noise_scale, noise_degrees
         if not noise_degrees > 0.0:
             along = 0.5 * self.change * np.sqrt(self.count) + self.gain  # b.d / |d|
@@ -284,7 +283,7 @@ class KindErrors:
             return 0.5 + 0.5 * float(np.sign(self.gain))
         both = zip(squares, (degrees, self.slow_degrees), strict=True)
         degrees = min(float(combine_degrees(total, both)), MOST_DEGREES)
-        return float(stdtr(degrees, self.gain / np.sqrt(total)))
+        return float(student_probability(degrees, self.gain / np.sqrt(total)))
 
 
 def compute_statistics(values: FloatArray) -> Statistics:

@@ -10,7 +10,6 @@ each other: threads compute them in any order, with the same numbers to the last
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property
 from numbers import Integral
 from typing import Any, ClassVar
@@ -750,6 +749,8 @@ def _fit_parts(
     batches = divide_trials(problem, threads)
     if threads == 1 or len(batches) == 1:
         return [fit(batch) for batch in batches]
+    from concurrent.futures import ThreadPoolExecutor
+
     with ThreadPoolExecutor(min(threads, len(batches))) as pool:
         return list(pool.map(fit, batches))
 

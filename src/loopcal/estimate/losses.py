@@ -19,6 +19,7 @@ import numpy as np
 
 from loopcal.errors import DataError, EstimationError
 from loopcal.frozen_dataclass import dataclass
+from loopcal.numerics.distributions import normal_probability
 from loopcal.numerics.statistics import compute_chi_square_quantile
 from loopcal.registry import Registry
 from loopcal.typing import FloatArray
@@ -148,9 +149,7 @@ def block_limit(single: float, degrees: FloatArray) -> FloatArray:
     """Return the limit (u,) of the norm of a block of `degrees` (u,) residuals with the exceedance
     probability of `single`, the limit of one normal residual, in standard deviations.
     """
-    from scipy.special import ndtr
-
-    exceedance = 2.0 * float(ndtr(-single))
+    exceedance = 2.0 * float(normal_probability(-single))
     # a quantile takes 30 us or more, and most blocks have the same number of residuals
     sizes, which = np.unique(np.maximum(degrees, 1.0), return_inverse=True)
     return np.sqrt(compute_chi_square_quantile(sizes, exceedance))[which]

@@ -30,6 +30,7 @@ from loopcal.estimate.false_alarms import FALSE_ALARMS
 from loopcal.findings import Finding, Severity, report_finding
 from loopcal.frozen_dataclass import dataclass, replace
 from loopcal.numerics.decomposition import Decomposition
+from loopcal.numerics.distributions import normal_quantile, student_quantile
 from loopcal.numerics.statistics import compute_chi_square_tail, compute_f_tail
 from loopcal.typing import FloatArray
 
@@ -305,10 +306,8 @@ def coverage_factor(degrees: FloatArray | float, level: float = LEVEL) -> FloatA
 
     They are those of Student's t, and of the normal distribution for infinite degrees of freedom.
     """
-    from scipy.special import ndtri, stdtrit
-
     quantile = 0.5 + 0.5 * level
     degrees = np.asarray(degrees, dtype=np.float64)
     is_known = np.isinf(degrees)
-    student = stdtrit(np.where(is_known, 1.0, degrees), quantile)
-    return np.asarray(np.where(is_known, ndtri(quantile), student))
+    student = student_quantile(np.where(is_known, 1.0, degrees), quantile)
+    return np.asarray(np.where(is_known, normal_quantile(quantile), student))

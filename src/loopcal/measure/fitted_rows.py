@@ -17,6 +17,7 @@ import numpy as np
 from loopcal.frozen_dataclass import dataclass
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.repeats import find_steps
+from loopcal.numerics.distributions import binomial_tail
 from loopcal.typing import BoolArray, FloatArray
 
 SAME = 1e-8  # share of what a column spans up to which two numbers are the same
@@ -57,12 +58,10 @@ def _find_agreeing(rows: ComparedRows, fitted: FloatArray, is_same_form: bool) -
     largest = float(chance[agree].max())
     if largest <= CHANCE:
         return agree
-    from scipy.special import bdtrc
-
     # whether more rows agree than repeats by chance would, each with this probability
     count = int(agree.sum())
     repeats = sum(len(near) > 0 for near in _find_repeats(rows, fitted))
-    return agree & bool(bdtrc(count - 1, max(repeats, count), largest) < CHANCE)
+    return agree & bool(binomial_tail(count - 1, max(repeats, count), largest) < CHANCE)
 
 
 def _estimate_chance(rows: ComparedRows, fitted: FloatArray, is_same_form: bool) -> FloatArray:

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """An instrument: the kinds it measures, each with its frame and its noise, and random streams."""
 
+from __future__ import annotations
+
 from abc import ABC, abstractmethod
 from typing import Literal, Self
 

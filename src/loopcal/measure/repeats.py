@@ -15,6 +15,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from loopcal.measure.observations import Observations
+from loopcal.numerics.distributions import binomial_tail
 from loopcal.typing import FloatArray, IntArray
 
 # Standard deviations of the noise by which repeats may differ. The readings of a few visits span
@@ -130,18 +131,11 @@ def find_copies(member: IntArray, values: FloatArray, sd: FloatArray, degrees: i
         single = OVERSTATED * (2.0 * np.floor(level / step) + 1.0) * step / (2.0 * np.sqrt(np.pi))
         single = np.sort(np.minimum(np.nan_to_num(single, nan=1.0), 1.0))
         chance = min(pairs / repeats * float(np.prod(single[-degrees:])), 1.0)
-        if agreeing and _compute_binomial_tail(agreeing, repeats, chance) < CHANCE:
+        if agreeing and binomial_tail(agreeing - 1, repeats, chance) < CHANCE:
             result[rows] = np.where(original < rows, original, -1)
             break
         rows = rows[np.bincount(label)[label] > 1]  # the others agree at no smaller level
     return result
-
-
-def _compute_binomial_tail(count: int, trials: int, chance: float) -> float:
-    """Return the probability of `count` or more of all trials."""
-    from scipy.special import bdtrc
-
-    return float(bdtrc(count - 1, trials, chance))
 
 
 def find_steps(values: FloatArray) -> FloatArray:

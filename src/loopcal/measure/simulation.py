@@ -319,7 +319,8 @@ def _draw_setup(
     one and no `stated` true value.
     """
     table = nuisance.table
-    is_drawn = table.free & ~np.isnan(table.tolerance) & ~np.isin(table.names, list(stated))
+    is_drawn = table.free & ~np.isnan(table.tolerance)
+    is_drawn &= np.array([name not in stated for name in table.names], dtype=bool)
     if not is_drawn.any():
         return table.nominal[None]
     streams = (make_random_stream(seed, trial, SETUP) for trial in range(trials))

@@ -37,6 +37,7 @@ from loopcal.mechanism.solutions import Solution, forward, inverse, make_solutio
 from loopcal.mechanism.states import driven_values, join_states
 from loopcal.mechanism.transmission import find_fixed_rows, invert_weights, select_weights
 from loopcal.mechanism.workspace import sample_workspace
+from loopcal.numerics.statistics import compute_median
 from loopcal.results.result import Result
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension
@@ -248,7 +249,7 @@ def compute_median_margins(robot: Mechanism) -> tuple[float, float]:
     if set(robot.controlled) <= stated:
         state = sample_workspace(robot, SAMPLE_SIZE).solution.state
     margin, _, drive_margin, _ = _compute_margins(robot, state)
-    return float(np.median(margin)), float(np.median(drive_margin))
+    return compute_median(margin), compute_median(drive_margin)
 
 
 def _compute_margins(

@@ -1,9 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The chi-square and F distributions: tail probabilities and quantiles.
-
-The functions of scipy are imported when a function is called, so that `import loopcal` does not
-pay for them.
-"""
+"""Tests by the chi-square and F distributions, and variance components."""
 
 from __future__ import annotations
 
@@ -13,6 +9,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from loopcal.numerics.distributions import (
+    chi_square_quantile,
+    chi_square_tail,
+    f_quantile,
+    f_tail,
+    normal_probability,
+)
 from loopcal.typing import FloatArray, IntArray
 
 NODES = 101
@@ -26,10 +29,8 @@ def compute_chi_square_tail(degrees: ArrayLike, statistic: ArrayLike) -> FloatAr
     ----------
     degrees : degrees of freedom. statistic : sum of squares [1]. Both broadcast.
     """
-    from scipy.special import chdtrc
-
     degrees = np.asarray(degrees, dtype=float)
-    tail = chdtrc(np.where(degrees > 0.0, degrees, 1.0), statistic)
+    tail = chi_square_tail(np.where(degrees > 0.0, degrees, 1.0), statistic)
     return np.where(degrees > 0.0, tail, 1.0)
 
 
@@ -39,12 +40,10 @@ def compute_f_tail(degrees: ArrayLike, left: ArrayLike, statistic: ArrayLike) ->
     F is a chi-square per degree of freedom, where the noise is estimated from residuals of `left`
     degrees of freedom; infinite for known noise. Without `degrees` the probability is 1.
     """
-    from scipy.special import fdtrc
-
     degrees, left = np.asarray(degrees, dtype=float), np.asarray(left, dtype=float)
     tested = np.where(degrees > 0.0, degrees, 1.0)
     is_estimated = (left > 0.0) & np.isfinite(left)
-    tail = fdtrc(tested, np.where(is_estimated, left, 1.0), statistic)
+    tail = f_tail(tested, np.where(is_estimated, left, 1.0), statistic)
     if not is_estimated.all():
         known = compute_chi_square_tail(tested, tested * np.asarray(statistic, dtype=float))
         tail = np.where(is_estimated, tail, known)
@@ -53,21 +52,17 @@ def compute_f_tail(degrees: ArrayLike, left: ArrayLike, statistic: ArrayLike) ->
 
 def compute_chi_square_quantile(degrees: ArrayLike, probability: ArrayLike) -> FloatArray:
     """Return the statistic that chi-square exceeds with a probability."""
-    from scipy.special import chdtri
-
-    return np.asarray(chdtri(degrees, probability), dtype=float)
+    return chi_square_quantile(degrees, probability)
 
 
 def compute_f_quantile(degrees: ArrayLike, left: ArrayLike, probability: ArrayLike) -> FloatArray:
     """Return the statistic that F exceeds with a probability; `left` are the degrees of freedom of
     the estimated noise, infinite for a known one: chi-square over `degrees`.
     """
-    from scipy.special import fdtri
-
     left = np.asarray(left, dtype=float)
     is_known = np.isinf(left)
     known = compute_chi_square_quantile(degrees, probability) / np.asarray(degrees)
-    estimated = fdtri(degrees, np.where(is_known, 1.0, left), 1.0 - np.asarray(probability))
+    estimated = f_quantile(degrees, np.where(is_known, 1.0, left), 1.0 - np.asarray(probability))
     return np.where(is_known, known, estimated)
 
 
@@ -84,13 +79,11 @@ def compute_averaged_tail(
     sources : the part of each source in the degrees of freedom of the chi-square, and the degrees
         of freedom nu of its variance.
     """
-    from scipy.special import chdtri
-
     total = sum(part for part, _ in sources)
     probability = (np.arange(NODES) + 0.5) / NODES
     true = np.zeros(1)
     for part, nu in sources:
-        times = np.ones(1) if np.isinf(nu) else nu / chdtri(nu, probability)
+        times = np.ones(1) if np.isinf(nu) else nu / chi_square_quantile(nu, probability)
         true = (true[:, None] + part / total * times).ravel()
     return float(compute_chi_square_tail(degrees, chi_square / true).mean())
 
@@ -298,8 +291,6 @@ def _tail_beyond_slope(values: FloatArray, counts: FloatArray, t: float) -> floa
     K(t) = -1/2 sum counts log(1 - 2 t values), K'(t) = x, w = sign(t) sqrt(2 (t x - K(t))),
     v = t sqrt(K''(t)), tail = 1 - Phi(w + log(v / w) / w).
     """
-    from scipy.special import ndtr
-
     tilted = values / (1.0 - 2.0 * t * values)
     K = -0.5 * float((counts * np.log1p(-2.0 * t * values)).sum())
     curvature = 2.0 * float((counts * tilted**2).sum())
@@ -308,7 +299,7 @@ def _tail_beyond_slope(values: FloatArray, counts: FloatArray, t: float) -> floa
     if abs(w) < 1e-4:  # the limit at the mean
         third = 8.0 * float((counts * tilted**3).sum())
         return float(0.5 - third / (6.0 * np.sqrt(2.0 * np.pi) * curvature**1.5))
-    return float(ndtr(-(w + np.log(v / w) / w)))
+    return float(normal_probability(-(w + np.log(v / w) / w)))
 
 
 def compute_weighted_quantile(weights: FloatArray, share: float) -> float:
@@ -368,3 +359,13 @@ def compute_median(values: FloatArray) -> float:
     if np.isnan(ordered[-1]):
         return float("nan")
     return float(np.mean(ordered[(len(ordered) - 1) // 2 : len(ordered) // 2 + 1]))
+
+
+def compute_known_median(values: FloatArray, axis: int) -> FloatArray:
+    """Return the medians along an axis of the values that are not NaN, as `np.nanmedian`; NaN
+    without any.
+    """
+    ordered = np.sort(values, axis=axis)  # NaN come last
+    count = (~np.isnan(ordered)).sum(axis=axis, keepdims=True)
+    middle = np.concatenate([np.maximum(count - 1, 0) // 2, count // 2], axis=axis)
+    return np.take_along_axis(ordered, middle, axis=axis).mean(axis=axis)

@@ -34,7 +34,7 @@ from loopcal.mechanism.kinematics import find_directly_reachable, forward_trials
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.solutions import forward
 from loopcal.numerics.gauss_newton import Halving
-from loopcal.numerics.statistics import choose_evenly
+from loopcal.numerics.statistics import choose_evenly, compute_known_median
 from loopcal.typing import FloatArray, IntArray
 from loopcal.units import Dimension
 
@@ -205,8 +205,9 @@ def exclude_far_rows(comparison: Comparison) -> Comparison:
     together = np.concatenate(ratios, axis=1)
     if np.isnan(together).all():
         return comparison
-    median = np.nanmedian(together, axis=1)
-    limit = np.maximum(FAR * median, np.nanquantile(together, 1.0 - MOST_EXCLUDED, axis=1))
+    limit = FAR * compute_known_median(together, axis=1)
+    if np.any(together > limit[:, None]):
+        limit = np.maximum(limit, np.nanquantile(together, 1.0 - MOST_EXCLUDED, axis=1))
     if not np.any(together > limit[:, None]):
         return comparison
     kept_rows, excluded, effort = [], [], comparison.effort

@@ -16,6 +16,7 @@ from loopcal.findings.wording import list_names, name_count
 from loopcal.frozen_dataclass import dataclass
 from loopcal.measure.kinds.joints import ActuatorReadings
 from loopcal.mechanism.model import Mechanism
+from loopcal.numerics.distributions import normal_quantile
 from loopcal.report.figures.style import (
     COLORS,
     DARK,
@@ -253,10 +254,8 @@ def _draw_histogram(axes: Axes, whitened: FloatArray) -> None:
 
 def _draw_normal_plot(axes: Axes, whitened: FloatArray) -> None:
     """Draw the sorted residuals over sigma against the quantiles of a normal distribution."""
-    from scipy.special import ndtri
-
     values = np.sort(whitened)
-    x = ndtri((np.arange(len(values)) + 0.5) / max(len(values), 1))
+    x = normal_quantile((np.arange(len(values)) + 0.5) / max(len(values), 1))
     _plot(axes, x, values, {"marker": "o", "ls": "none", "color": COLORS[0], "ms": DOT - 0.5})
     if len(values):
         axes.plot(x[[0, -1]], x[[0, -1]], color=DARK, lw=LINE)
