@@ -25,7 +25,7 @@ from loopcal.measure.observations import Observations
 from loopcal.measure.readings import list_joint_dimensions, resolve_reading_sigma
 from loopcal.measure.repeats import find_copies, find_reading_tolerance
 from loopcal.mechanism.model import Mechanism
-from loopcal.numerics.statistics import compute_known_median, find_distinct
+from loopcal.numerics.statistics import compute_known_median, compute_median, find_distinct
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import DISPLAY_UNITS, find_unit
 
@@ -217,7 +217,7 @@ def _list_compared_values(
     named = {column.name: sd for column, sd in zip(kind.noise_columns, noise, strict=True)}
     # several columns of an orientation share the noise of its angles
     angles = [sd for name, sd in named.items() if name not in {c.name for c in kind.columns}]
-    usual = float(np.median(angles or noise))
+    usual = compute_median(np.array(angles or noise))
     return values, np.array([named.get(c.name, usual) for c in kind.columns]), len(noise)
 
 
