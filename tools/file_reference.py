@@ -171,7 +171,11 @@ def _describe_columns(columns: Iterable[Column]) -> str:
     """Return columns with an example of their unit."""
     return " ".join(
         f"`{c.name}`"
-        + ("" if c.dimension is Dimension.RATIO else f" [{DISPLAY_UNITS[c.dimension].symbol}]")
+        + (
+            ""
+            if c.dimension in (Dimension.RATIO, Dimension.COUNT)
+            else f" [{DISPLAY_UNITS[c.dimension].symbol}]"
+        )
         for c in columns
     )
 

@@ -24,6 +24,8 @@ class Dimension(Enum):
     LENGTH = "length"
     ANGLE = "angle"
     RATIO = "ratio"
+    PIXEL = "pixel"
+    COUNT = "count"
     TEMPERATURE = "temperature"
     TIME = "time"
     FORCE = "force"
@@ -50,6 +52,7 @@ SD_RANGE = f"from {SMALLEST_SD:g} to {LARGEST:g} m, rad or 1"
 Length = Annotated[float, Dimension.LENGTH]
 Angle = Annotated[float, Dimension.ANGLE]
 Ratio = Annotated[float, Dimension.RATIO]
+Pixel = Annotated[float, Dimension.PIXEL]
 
 
 @dataclass(frozen=True)
@@ -81,6 +84,7 @@ UNITS: dict[str, Unit] = {
         Unit("1", Dimension.RATIO, 1.0),
         Unit("ppm", Dimension.RATIO, 1e-6),
         Unit("um/m", Dimension.RATIO, 1e-6),
+        Unit("px", Dimension.PIXEL, 1.0),
         Unit("degC", Dimension.TEMPERATURE, 1.0),
         Unit("s", Dimension.TIME, 1.0),
         Unit("N", Dimension.FORCE, 1.0),
@@ -114,6 +118,8 @@ SI_SYMBOLS: dict[Dimension, str] = {
     Dimension.LENGTH: "m",
     Dimension.ANGLE: "rad",
     Dimension.RATIO: "1",
+    Dimension.PIXEL: "px",
+    Dimension.COUNT: "",
     Dimension.TEMPERATURE: "degC",
     Dimension.TIME: "s",
     Dimension.FORCE: "N",
@@ -126,6 +132,7 @@ DISPLAY_UNITS: dict[Dimension, Unit] = {
     Dimension.LENGTH: UNITS["mm"],
     Dimension.ANGLE: UNITS["deg"],
     Dimension.RATIO: UNITS["1"],
+    Dimension.PIXEL: UNITS["px"],
     Dimension.TEMPERATURE: UNITS["degC"],
     Dimension.TIME: UNITS["s"],
     Dimension.FORCE: UNITS["N"],
@@ -140,6 +147,7 @@ EXAMPLES: Mapping[Dimension, str] = {
     Dimension.LENGTH: "0.02mm",
     Dimension.ANGLE: "0.01deg",
     Dimension.RATIO: "1.5 1",
+    Dimension.PIXEL: "0.1px",
     Dimension.TEMPERATURE: "21.5degC",
     Dimension.TIME: "60s",
     Dimension.FORCE: "500N",
@@ -157,6 +165,7 @@ ARTICLES = {
     Dimension.LENGTH: "a length",
     Dimension.ANGLE: "an angle",
     Dimension.RATIO: "a ratio",
+    Dimension.PIXEL: "a number of pixels",
     Dimension.TEMPERATURE: "a temperature",
     Dimension.TIME: "a time",
 }

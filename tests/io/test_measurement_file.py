@@ -56,6 +56,7 @@ def make_measurements(robot, poses, kind) -> Measurements:
         places = [i for i, column in enumerate(kind.columns) if column.name in names]
         if places:
             values[:, places] /= np.linalg.norm(values[:, places], axis=1, keepdims=True)
+    values[:, : kind.label_count] = kind.list_labels(len(values))
     seen = links if kind.poses_per_row > 1 else links[:, 0]
     sigma = np.linspace(1e-6, 2e-6, len(kind.noise_columns))
     rows = Observations.from_sigma(kind.with_tool(robot.tool), seen, values, sigma)

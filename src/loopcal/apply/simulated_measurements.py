@@ -182,7 +182,10 @@ def build_instrument(
     possible: dict[str, Any] = {"orientation": description.orientation}
     possible |= {key: tuple(getattr(description, key)) for key in ("components", "joints")}
     settings = {name: value for name, value in possible.items() if value}
-    sigma = {Dimension.LENGTH: description.sigma_position, Dimension.ANGLE: description.sigma_angle}
+    sigma = SIGMA | {
+        Dimension.LENGTH: description.sigma_position,
+        Dimension.ANGLE: description.sigma_angle,
+    }
     sensors, stated = [], list[StatedValue]()
     for i, name in enumerate(description.kinds):
         if name not in KINDS:

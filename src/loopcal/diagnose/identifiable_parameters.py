@@ -536,9 +536,12 @@ def _list_candidates(robot: Mechanism, joints: list[tuple[str, str]]) -> Iterato
     """Yield measurements with their descriptions, the simplest first: without a frame, single
     coordinates, other kinds, joints.
     """
-    # examples of Component and JointSensor belong to one robot; both are made for this one
+    # examples of Component and JointSensor belong to one robot; both are made for this one. What a
+    # camera sees depends on where it stands
     known = [
-        kind for kind in KINDS.values() if not issubclass(kind, (Closure, Component, JointSensor))
+        kind
+        for kind in KINDS.values()
+        if not (kind.label_count or issubclass(kind, (Closure, Component, JointSensor)))
     ]
     yield from _list_examples([kind for kind in known if kind.poses_per_row > 1])
     for names in SINGLE:

@@ -426,7 +426,7 @@ class PosePredictions:
         for i, o in enumerate(observations):
             setup, joints = self._inputs_of(i, o)
             zero = np.zeros((1, *o.present.shape))
-            expected = o.kind.measure(self.T[:, o.rows], zero, setup, joints)
+            expected = o.kind.measure(self.T[:, o.rows], zero, setup, joints, o.labels)
             _, reached_joints = other._inputs_of(i, o)
             evaluation = o.kind.evaluate(other.T[:, o.rows], expected, setup, reached_joints)
             differences.append(evaluation.residual[0])

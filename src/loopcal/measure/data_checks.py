@@ -238,7 +238,9 @@ def check_targets_move(
     for static in _find_static_targets(measurements):
         rows, kind = static.rows, static.rows.kind
         predicted = kind.measure(
-            T[None, rows.rows], np.zeros((1, len(rows), len(kind.noise_columns)))
+            T[None, rows.rows],
+            np.zeros((1, len(rows), len(kind.noise_columns))),
+            labels=rows.labels,
         )[0]
         values = np.sort(predicted[static.present][:, static.columns], axis=0)
         # without the most extreme pose: a wrong one does not show that the others move the target
@@ -313,7 +315,7 @@ def _is_rigid_motion(
     motions[:3, :3, :3] = geometry.exp_so3(h * np.eye(3))
     motions[3:, :3, 3] = h * np.eye(3)
     noise = np.zeros((6, len(T), len(kind.noise_columns)))
-    moved = kind.measure(motions[:, None] @ T, noise)
+    moved = kind.measure(motions[:, None] @ T, noise, labels=static.rows.labels)
     cells = np.ix_(np.flatnonzero(static.present), np.array(static.columns))
     slope = np.stack([(values[cells] - predicted[cells]).ravel() / h for values in moved], axis=1)
     change = predicted[cells] - static.rows.measured[cells]
@@ -322,6 +324,18 @@ def _is_rigid_motion(
     is_constant = np.ptp(rest, axis=0) <= CONSTANT_SHARE * possible
     turn, shift = np.linalg.norm(motion[:3]), np.linalg.norm(motion[3:]) / size
     return bool(is_constant.all() and max(turn, shift) <= LARGEST_TILT)
+
+
+def _choose_alike(rows: Observations) -> BoolArray:
+    """Return which rows (r,) measure the same as most others do, such as one corner of a board."""
+    if not rows.kind.label_count:
+        return np.ones(len(rows), dtype=bool)
+    _, of, count = np.unique(
+        rows.labels[rows.is_measured], axis=0, return_inverse=True, return_counts=True
+    )
+    alike = np.zeros(len(rows), dtype=bool)
+    alike[rows.is_measured] = of.ravel() == np.argmax(count) if len(count) else False
+    return alike
 
 
 def _find_static_targets(measurements: Measurements) -> Iterator[_StaticTarget]:
@@ -338,8 +352,9 @@ def _find_static_targets(measurements: Measurements) -> Iterator[_StaticTarget]:
             for j, column in enumerate(kind.columns):
                 targets.setdefault(column.name, [j])
         for session in find_distinct(rows.session):
+            alike = _choose_alike(rows)
             for target, columns in targets.items():
-                is_complete = ~np.any(np.isnan(rows.measured[:, columns]), axis=1)
+                is_complete = alike & ~np.any(np.isnan(rows.measured[:, columns]), axis=1)
                 present = (rows.session == session) & is_complete
                 if np.count_nonzero(present) < 3:
                     continue

@@ -26,7 +26,7 @@ from loopcal.typing import FloatArray, IntArray
 from loopcal.units import SD_RANGE, Dimension, is_sd
 
 # Standard deviations [SI] of an instrument where none are stated.
-SIGMA = {Dimension.LENGTH: 1e-5, Dimension.ANGLE: 5e-5, Dimension.RATIO: 5e-5}
+SIGMA = {Dimension.LENGTH: 1e-5, Dimension.ANGLE: 5e-5, Dimension.RATIO: 5e-5, Dimension.PIXEL: 0.1}
 
 
 class Noise(ABC):
@@ -137,7 +137,8 @@ class Sensor:
 
     Parameters
     ----------
-    rows : (r,) or (r, l) poses of each row. Default: every pose once. Where a row compares poses:
+    rows : (r,) or (r, l) poses of each row. Default: every pose once, or as often as the kind has
+        rows for each pose (`Kind.rows_per_pose`). Where a row compares poses:
         each pose with the next one, and the last with the first. Targets on the base are measured
         twice by default, before and after the poses; only the number of their rows matters.
     session, group : text or (r,) text, see `Observations`.
@@ -202,7 +203,7 @@ class Sensor:
         if self.rows is not None:
             return check_rows(self.rows, self.kind)
         if self.kind.poses_per_row == 1:
-            return np.arange(n)
+            return np.repeat(np.arange(n), self.kind.rows_per_pose)
         if n < 2:
             raise DataError(
                 f"a row of kind {self.kind.name!r} compares two poses, but the number of poses is "

@@ -239,7 +239,8 @@ def _enter(entries: dict[str, Parameter], parameter: Parameter, owner: str, kind
 def _check_common(kind: Kind, common: Collection[str]) -> None:
     """Refuse names of frames, targets and surfaces that all sessions have in common."""
     for item, of_item in kind.own_items.items():
-        for name in (p.name for p in of_item.parameters if item != kind.bias_item):
+        may_be_common = (kind.bias_item, *kind.common_items)
+        for name in (p.name for p in of_item.parameters if item not in may_be_common):
             if name in common:
                 raise DataError(
                     f"the scope of {name!r} is all, but only offsets and common errors of an "

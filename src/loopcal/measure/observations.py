@@ -34,6 +34,7 @@ SIZE_UNITS = {  # of standard deviations that a program stated
     Dimension.LENGTH: ("um", 1e-6),
     Dimension.ANGLE: ("urad", 1e-6),
     Dimension.RATIO: ("ppm", 1e-6),
+    Dimension.PIXEL: ("px", 1.0),
 }
 DATES = ("calibrated", "due", "measured")  # fields of an instrument that hold a date
 TextArray = NDArray[np.str_]  # names of sessions or groups
@@ -357,6 +358,11 @@ class Observations:
     def is_measured(self) -> BoolArray:
         """(r,) rows of which a component is present, or whose kind has none (`closure`)."""
         return self.present.any(axis=1) | (self.present.shape[1] == 0)
+
+    @property
+    def labels(self) -> FloatArray:
+        """(r, l) the columns that say what each row measures, such as its corner of a board."""
+        return self.measured[:, : self.kind.label_count]
 
     @property
     def drift_part(self) -> FloatArray:

@@ -279,6 +279,13 @@ def simulate_trials(
         noise = np.stack([sensor.noise.draw(stream, len(rows)) for stream in streams])
         setup = nuisance.select(k, true_setup)
         columns = kind.measure(seen[:, rows], noise, setup, kind.stack_joints(joints, rows))
+        columns = kind.hide_unseen(seen[:, rows], columns, setup)
+        if kind.label_count and not kind.detect_present(columns).any():
+            raise DataError(
+                f"the kind {kind.name!r} sees nothing at any pose: every corner is outside the "
+                "picture, behind the camera, or on the back of the board. Correct T_camera and "
+                "T_board"
+            )
         for _, problem in kind.find_invalid_rows(np.concatenate(columns)):
             raise DataError(
                 report_finding(
@@ -290,7 +297,8 @@ def simulate_trials(
             )
         if not kind.is_of_base:
             complete = np.all(reached[:, rows].reshape(len(reached), len(rows), -1), axis=-1)
-            columns = np.where(complete[..., None], columns, np.nan)
+            is_measured = np.arange(columns.shape[-1]) >= kind.label_count
+            columns = np.where(complete[..., None] | ~is_measured, columns, np.nan)
         measured.append(columns)
     shown = true if disturbance.readings is None else true - disturbance.readings
     recorded = _record_readings(robot, shown, reading_sigma, len(values), seed)

@@ -224,7 +224,7 @@ def _list_nuisance(mounted: Instrument, members: IntArray) -> NuisanceParameters
 def _assign_poses(mounted: Instrument, members: IntArray) -> list[tuple[Sensor, IntArray]]:
     """Return each sensor of poses with the poses of its rows, group by group."""
     return [
-        (s, members.ravel() if s.kind.poses_per_row == 1 else members)
+        (s, np.repeat(members, s.kind.rows_per_pose) if s.kind.poses_per_row == 1 else members)
         for s in mounted.sensors
         if not s.kind.is_of_base
     ]
@@ -293,7 +293,9 @@ def _linearize_block(
         )
         joints = kind.stack_joints(observed.joints, rows)
         noise = np.zeros((1, len(rows), len(kind.noise_columns)))
-        measured = kind.measure(observed.T[:, rows], noise, values, joints)[0]
+        measured = kind.measure(observed.T[:, rows], noise, values, joints)
+        setup = kind.nominal_values[None, None] if values is None else values
+        measured = kind.hide_unseen(observed.T[:, rows], measured, setup)[0]
         # what is undefined there, such as the direction from a point to itself
         undefined = [row for row, _ in kind.find_invalid_rows(measured)]
         unusable[[row * len(members) // len(rows) for row in undefined]] = True

@@ -235,7 +235,8 @@ def test_singular_covariance_and_duplicate_rows_are_refused(kind):
     T = geometry.apply_twist(np.eye(4), np.random.default_rng(0).uniform(-0.4, 0.4, (1, 3, 6)))
     rows = np.array([0, 1, 1]) if kind.poses_per_row == 1 else np.array([[0, 1], [1, 2], [1, 2]])
     m = len(kind.noise_columns)
-    measured = kind.measure(T[:, rows], np.zeros((1, 3, m)))[0]
+    one = np.zeros((3, kind.label_count))
+    measured = kind.measure(T[:, rows], np.zeros((1, 3, m)), labels=one)[0]
     with pytest.raises(DataError, match="the covariance of row 1"):
         Observations(kind, rows, measured, np.zeros((m, m)))
     twice = Observations.from_sigma(kind, rows, measured, 1e-4)
@@ -299,7 +300,8 @@ def test_constant_values_are_refused_for_every_kind_that_follows_the_robot(kind)
     )
     noise = 1e-6 * np.random.default_rng(1).normal(size=(1, 8, len(kind.noise_columns)))
     true, still = (
-        kind.measure(poses[None], noise)[0] for poses in (T, np.repeat(T[:1], 8, axis=0))
+        kind.measure(poses[None], noise, labels=np.zeros((8, kind.label_count)))[0]
+        for poses in (T, np.repeat(T[:1], 8, axis=0))
     )
     check_targets_move(collect(kind, true, 1e-6), T, SIZE)
     with expect_refusal("conventions.target-never-moves", DataError, kind=kind.name):

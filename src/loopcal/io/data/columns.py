@@ -125,6 +125,21 @@ class NumberColumn(Column):
 
 
 @dataclass(frozen=True)
+class CountColumn(Column):
+    """A column of whole numbers, such as the corner of a board, without a unit."""
+
+    def parse(self, table: Table) -> FloatArray:
+        """Return the numbers, NaN where a cell is empty."""
+        if table.units[self.name] is not None:
+            raise table.header_error(f"column {self.name!r} has a unit. Remove it: it only counts")
+        return table.scaled_numbers(self.name, 1.0)
+
+    def format(self, value: Any) -> str:
+        """Return the number; nothing for NaN."""
+        return "" if math.isnan(float(value)) else f"{float(value):g}"
+
+
+@dataclass(frozen=True)
 class ProductColumn(Column):
     """A column of covariances, whose unit is a product such as `[mm*mrad]`."""
 
@@ -280,7 +295,9 @@ class ColumnRule(NamedTuple):
     match: Callable[[str], Column | None] = lambda _: None
 
 
-def _number(name: str, dimension: Dimension) -> NumberColumn:
+def _number(name: str, dimension: Dimension) -> Column:
+    if dimension is Dimension.COUNT:
+        return CountColumn(name)
     return NumberColumn(name, dimension, DISPLAY_UNITS[dimension].symbol)
 
 
@@ -310,6 +327,13 @@ RULES: tuple[ColumnRule, ...] = (
     ),
     _text_rule("poses of a block are never split between fit and validation", BLOCK_COLUMN),
     _text_rule("label of the kind, in files with several kinds", TextColumn("kind")),
+    ColumnRule(
+        "camera, board",
+        "",
+        "of the kind image: its settings of these names, by which a row belongs to one of several "
+        "kinds without the column `kind`",
+        lambda _, kinds: [TextColumn(name) for kind in kinds for name in kind.row_settings],
+    ),
     _text_rule("rows of a session share unknown frames and targets", TextColumn("session")),
     _text_rule("rows of a group share a surface or the constant of a lock", TextColumn("group")),
     ColumnRule("ACTUATOR", "[mm] or [deg]", "reading of the actuator", _readings),

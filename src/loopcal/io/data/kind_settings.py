@@ -76,6 +76,7 @@ from loopcal.units import (
     Angle,
     Dimension,
     Length,
+    Pixel,
     Ratio,
     Unit,
     find_sd_fault,
@@ -94,6 +95,7 @@ NOISE_UNITS = {
     Dimension.LENGTH: ("um", 1e-6),
     Dimension.ANGLE: ("urad", 1e-6),
     Dimension.RATIO: ("1", 1.0),
+    Dimension.PIXEL: ("px", 1.0),
 }
 ASSUMED = "assumed"
 """Word for noise that a program assumed."""
@@ -361,7 +363,7 @@ EXAMPLE = (
 )
 
 
-_NUMBERS: tuple[Any, ...] = (Length, Angle, Ratio)
+_NUMBERS: tuple[Any, ...] = (Length, Angle, Ratio, Pixel)
 RECORDS = {
     dimension: make_dataclass(
         "KnownParameter",
@@ -374,7 +376,7 @@ RECORDS = {
         frozen=True,
     )
     for dimension, number in zip(
-        (Dimension.LENGTH, Dimension.ANGLE, Dimension.RATIO), _NUMBERS, strict=True
+        (Dimension.LENGTH, Dimension.ANGLE, Dimension.RATIO, Dimension.PIXEL), _NUMBERS, strict=True
     )
 }
 """Dimension -> record of the knowledge of a parameter."""
@@ -770,6 +772,9 @@ SETTINGS: Mapping[str, str] = {
     "one; that of the robot file by default",
     "poses": "another file in this folder, with the readings of the poses",
 }
+ROW_SETTINGS = ("camera", "board")
+"""Settings of kinds that are columns, too, by which a row belongs to a kind."""
+
 KIND_SETTINGS = ("noise", "noise_source", "instrument", *SHARED_ERRORS)
 """Settings beside those of the kind itself."""
 
@@ -819,16 +824,22 @@ def read_kinds(table: Table, robot: Mechanism, several: bool = False) -> tuple[K
         if not isinstance(labeled, dict) or not all(isinstance(n, dict) for n in labeled.values()):
             example = "'kinds: {height: {kind: component, ..}}'"
             raise file.error(f"'kinds' must map labels to kinds, as {example}", ("kinds",))
-        require_columns(table, ["kind"], "which assigns each row to one of the kinds")
+        by_settings = "kind" not in table.units
+        if not (by_settings and any(name in table.units for name in ROW_SETTINGS)):
+            require_columns(table, ["kind"], "which assigns each row to one of the kinds")
+            by_settings = False
         cells = np.array(table.text("kind"))
         for row, cell in enumerate(cells):
             if cell and cell not in labeled:  # without a kind, a row only holds readings
                 sentence = f"column 'kind' is {cell!r}. Allowed: {', '.join(labeled)}"
                 raise table.row_error(row, sentence)
         kinds = tuple(
-            _read_entry(file, node, robot, ("kinds", label), np.flatnonzero(cells == label))
+            _read_entry(
+                file, node, robot, ("kinds", label), np.flatnonzero(by_settings | (cells == label))
+            )
             for label, node in labeled.items()
         )
+    kinds = _select_by_settings(table, kinds)
     refuse_unknown_columns(table, robot, [entry.kind for entry in kinds])
     return kinds
 
@@ -923,6 +934,29 @@ def _read_robot_kind(
     except DataError as error:
         raise file.error(error.args[0], (*place, "kind")) from None
     return kind
+
+
+def _select_by_settings(table: Table, kinds: tuple[KindRows, ...]) -> tuple[KindRows, ...]:
+    """Return kinds with those rows whose cells repeat the kind's settings, such as its camera;
+    FileError for a row that belongs to no kind, or to two.
+    """
+    selected, count, offered = [], np.zeros(len(table), int), np.zeros(len(table), bool)
+    for entry in kinds:
+        names = [name for name in entry.kind.row_settings if name in table.units]
+        rows = entry.rows
+        for name in names:
+            cells = np.array(table.text(name))
+            offered[rows[cells[rows] != ""]] = True
+            rows = rows[cells[rows] == getattr(entry.kind, name)]
+        if names:
+            count[rows] += 1
+        selected.append(replace(entry, rows=rows))
+    for row in np.flatnonzero((offered & (count == 0)) | (count > 1)).tolist():
+        cells = ", ".join(f"{n} {table.text(n)[row]!r}" for n in ROW_SETTINGS if n in table.units)
+        which = "no kind has" if not count[row] else "several kinds have"
+        act = "Correct the cell, or the settings of the kinds"
+        raise table.row_error(row, f"{which} {cells}. {act}")
+    return tuple(selected)
 
 
 def _select_rows(table: Table, entry: KindRows, members: Sequence[tuple[int, ...]]) -> KindRows:

@@ -215,6 +215,7 @@ def format_data_sheet(
         if sensor.rows is None:
             continue
         empty = np.full((len(sensor.rows), len(sensor.kind.columns)), np.nan)
+        empty[:, : sensor.kind.label_count] = sensor.kind.list_labels(len(empty))
         sigma = sensor.noise.sigma
         rows.append(
             Observations.from_sigma(

@@ -29,6 +29,7 @@ KINDS: Registry[type[Kind]] = Registry(
         "bearing": "loopcal.measure.kinds.position:Bearing",
         "distance": "loopcal.measure.kinds.distance:Distance",
         "separation": "loopcal.measure.kinds.distance:Separation",
+        "image": "loopcal.measure.kinds.image:Image",
         "plane": "loopcal.measure.kinds.surfaces:Plane",
         "line": "loopcal.measure.kinds.surfaces:Line",
         "sphere": "loopcal.measure.kinds.surfaces:Sphere",

@@ -8,7 +8,8 @@ follow. A kind receives platform poses, not the robot. It states
 * `possible_setup`: frames, targets, surfaces and offsets that may be unknown;
 * `_predict`: columns without noise, and derivatives; or, where noise is not just added to the
   columns, `_evaluate` and `_measure`;
-* `guess_values`, if its parameters follow from data in closed form.
+* `guess_values`, if its parameters follow from data in closed form;
+* `label_count` and `rows_per_pose`, if a row is one of many targets, whose number is in a column.
 
 Example: `loopcal.measure.kinds.distance`. Shapes: t trials, r rows, c columns as in files,
 m residuals (often c), u nuisance parameters of the kind, j joints that it senses. A kind with
@@ -135,7 +136,11 @@ def list_error_groups(kind: Kind) -> tuple[ErrorGroup, ...]:
         targets = {name: (i,) for i, name in enumerate(kind.sensed_joints)}
     elif residuals == kind.columns:
         targets = kind.target_columns
-    quantities = {Dimension.LENGTH: kind.length_error, Dimension.ANGLE: kind.angle_error}
+    quantities = {
+        Dimension.LENGTH: kind.length_error,
+        Dimension.ANGLE: kind.angle_error,
+        Dimension.PIXEL: "image",
+    }
     groups = []
     for target, places in targets.items():
         for dimension, quantity in quantities.items():
@@ -212,7 +217,10 @@ class Kind(ABC):
         the name.
     length_error, angle_error : what its residuals are errors of, by dimension, such as "position".
     allowed_unknown : setup items that `unknown` may list. bias_item : the one that the bias of a
-        session is.
+        session is. common_items : those that all sessions may have in common.
+    label_count : number of the first columns that say what a row measures, such as the corner of a
+        board. row_settings : names of settings that a column of a file may repeat, by which its
+        rows belong to one of several kinds.
     unknown : setup items that are unknown; "bias" stands for `bias_item`.
     measures_points : whether it measures targets, which may be fixed to the base (`of: base`).
     of : the stage of a chain whose platform is measured, or "base"; empty for the end platform.
@@ -231,6 +239,9 @@ class Kind(ABC):
     angle_error: ClassVar[str] = "angle"
     allowed_unknown: ClassVar[tuple[str, ...]] = ()
     bias_item: ClassVar[str] = BIAS
+    common_items: ClassVar[tuple[str, ...]] = ()
+    label_count: ClassVar[int] = 0
+    row_settings: ClassVar[tuple[str, ...]] = ()
     unknown: tuple[str, ...] = ()
     of: str = ""
 
@@ -297,6 +308,25 @@ class Kind(ABC):
     def target_columns(self) -> Mapping[str, tuple[int, ...]]:
         """The measured objects by name, with the indices of their columns."""
         return {self.name: tuple(range(len(self.columns)))}
+
+    @property
+    def rows_per_pose(self) -> int:
+        """Number of rows that an instrument measures at each pose."""
+        return 1
+
+    def list_labels(self, r: int) -> FloatArray:
+        """Return the labels (r, `label_count`) of the rows of a simulation."""
+        return np.zeros((r, 0))
+
+    def name_label(self, columns: FloatArray) -> str:
+        """Return what a row (c,) measures, such as a corner; empty where all rows are alike."""
+        del columns
+        return ""
+
+    def hide_unseen(self, T: FloatArray, columns: FloatArray, values: FloatArray) -> FloatArray:
+        """Return measured columns (t, r, c) with NaN where an instrument sees nothing."""
+        del T, values
+        return columns
 
     @property
     def is_of_base(self) -> bool:
@@ -613,6 +643,7 @@ class Kind(ABC):
         noise: FloatArray,
         nuisance: FloatArray | None = None,
         joints: FloatArray | None = None,
+        labels: FloatArray | None = None,
     ) -> FloatArray:
         """Return the columns (t, r, c) [SI] that an instrument with this noise writes.
 
@@ -622,11 +653,16 @@ class Kind(ABC):
         ----------
         T : (t, r, 4, 4) true T_base_platform. noise : (t, r, m) in the noise columns.
         nuisance : (t or 1, r or 1, u), default nominal. joints : (t, r, j), default zero.
+        labels : (r, `label_count`) of the rows, default `list_labels`.
         """
         values = self.nominal_values[None, None] if nuisance is None else nuisance
         joints = np.zeros_like(noise) if joints is None else joints
         if constants := self._list_unknown((BIAS, DRIFT)):
             noise = noise + self._sum_items(values, constants) @ self._spread.T
+        if self.label_count:
+            labels = self.list_labels(noise.shape[1]) if labels is None else labels
+            labels = np.broadcast_to(labels, (*noise.shape[:2], self.label_count))
+            noise = np.concatenate([labels, noise], axis=-1)
         columns = self._measure(self._find_platform(T, joints), noise, values, joints)
         if scales := self._list_unknown(SCALES):
             (of_columns, places), columns = self._length_places, np.array(columns)
@@ -659,7 +695,7 @@ class Kind(ABC):
     def _measure(
         self, T: FloatArray, noise: FloatArray, values: FloatArray, joints: FloatArray
     ) -> FloatArray:
-        """Return `measure` for complete arrays."""
+        """Return `measure` for complete arrays; the noise begins with the labels of the rows."""
         return self._predict(T, values, joints).residual + noise
 
     def _subtract(self, predicted: FloatArray, measured: FloatArray) -> FloatArray:

@@ -1,0 +1,424 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Kind `image`: corners of a printed board in pictures, by any camera."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import ClassVar, Self
+
+import numpy as np
+
+from loopcal import geometry
+from loopcal.errors import DataError
+from loopcal.geometry import align_point_sets, solve_frame_and_points, solve_hand_eye
+from loopcal.measure.array_checks import check_pose, set_fields
+from loopcal.measure.camera_geometry import (
+    LENS,
+    calibrate_camera,
+    locate_boards,
+    project,
+    shows_board,
+    solve_focal_lengths,
+)
+from loopcal.measure.kinds import setup_parameters as setup
+from loopcal.measure.kinds.kind import Column, Evaluation, InvalidRows, Kind, checked, list_rows
+from loopcal.numerics.statistics import choose_evenly
+from loopcal.parameters import Parameter
+from loopcal.typing import BoolArray, FloatArray, IntArray
+from loopcal.units import Dimension, Length, Pixel, Ratio
+
+LENS_ITEMS = {"focal": LENS[:2], "center": LENS[2:4], "radial": LENS[4:7], "tangential": LENS[7:]}
+PRINT, BEND = ("scale_x", "scale_y"), ("bend_x", "bend_y", "bend_xy")
+PICTURES = 40  # pictures, evenly chosen, of which start values are made
+GRAZING = 0.2  # sine of the angle between board and line of sight below which no corner is found
+
+
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
+class Image(Kind):
+    """Pixels u, v of the corners of a printed board. Residual: `predicted - measured`.
+
+    A row is one corner of one picture. The corner i of a board with c columns is at column `i mod
+    c` and row `i div c`, (0, 0) being the origin of the board, x along its columns and y along its
+    rows. A printer scales both axes, and paper bends: with column and row h, k from -1 to 1,
+    `p = (x (1 + scale_x), y (1 + scale_y), bend_x h^2 + bend_y k^2 + bend_xy h k)`. The camera is
+    that of `loopcal.measure.camera_geometry`. Its z axis is the line of sight, x is right and y
+    down in the picture.
+
+    Setup parameters: `camera.rx` to `camera.z` and `board.rx` to `board.z` [rad, m]; `camera.fx`,
+    `fy`, `cx`, `cy` [px], `k1`, `k2`, `k3`, `p1`, `p2`; `board.scale_x`, `board.scale_y`, and
+    `board.bend_x`, `bend_y`, `bend_xy` [m].
+
+    Parameters
+    ----------
+    mount : what the platform carries, the "board" or the "camera"; the other one is fixed.
+    T_camera, T_board : (4, 4), camera and board in the body that carries them (platform or base).
+        If unknown, the nominal values.
+    camera, board : their names. Kinds with the same name share the parameters.
+    lens : name of the lens, by which several cameras share its parameters, such as one phone at
+        two stations; default: the name of the camera.
+    size : width and height of a picture. focal : (fx, fy); default: the width of the picture.
+    center : (cx, cy); default: the middle of the picture. distortion : (k1, k2, k3, p1, p2).
+    corners : columns and rows of corners. square : distance of neighbors, as designed.
+    unknown : which of "camera", "board", "focal", "center", "radial" (k1, k2, k3), "tangential"
+        (p1, p2), "print" (the scales) and "bend" are unknown.
+
+    Raises
+    ------
+    DataError : another mount, a board with fewer than two corners a side, or a length not above 0.
+    """
+
+    unknown: tuple[str, ...] = ()
+    mount: str = "board"
+    T_camera: FloatArray = checked(check_pose, "T_camera", np.eye(4))
+    T_board: FloatArray = checked(check_pose, "T_board", np.eye(4))
+    camera: str = "camera"
+    board: str = "board"
+    lens: str = ""
+    size: tuple[int, int] = (4000, 3000)
+    focal: tuple[Pixel, Pixel] | None = None
+    center: tuple[Pixel, Pixel] | None = None
+    distortion: tuple[Ratio, Ratio, Ratio, Ratio, Ratio] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    corners: tuple[int, int] = (9, 6)
+    square: Length = 0.02
+
+    name: ClassVar[str] = "image"
+    label_count: ClassVar[int] = 1
+    description: ClassVar[str] = "pictures of a printed board by a camera"
+    allowed_unknown: ClassVar[tuple[str, ...]] = ("camera", "board", *LENS_ITEMS, "print", "bend")
+    common_items: ClassVar[tuple[str, ...]] = (*LENS_ITEMS, "print", "bend")
+    row_settings: ClassVar[tuple[str, ...]] = ("camera", "board")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.mount not in ("board", "camera"):
+            raise DataError(
+                f"the mount is {self.mount!r}. Write what the platform carries: board or camera"
+            )
+        for name in ("size", "corners", "distortion"):
+            set_fields(self, **{name: tuple(getattr(self, name))})
+        if min(self.corners) < 2 or not self.square > 0.0:
+            raise DataError(
+                f"a board of {self.corners[0]} x {self.corners[1]} corners at {self.square} m. "
+                "Give at least 2 columns and rows of corners, at a distance above 0"
+            )
+        if min(self.size) < 1 or not min(self.nominal_lens[:2]) > 0.0:
+            raise DataError("the size of a picture and the focal length must be above 0")
+
+    @classmethod
+    def examples(cls) -> tuple[Self, ...]:
+        """Return a known camera, one of which all is unknown, and one on the platform."""
+        ahead = geometry.make_pose(
+            geometry.exp_so3(np.array([0.3, -0.2, 0.1])), np.array([0.3, 0.4, -1.1])
+        )
+        board = geometry.make_pose(
+            geometry.exp_so3(np.array([0.2, 0.3, -0.1])), np.array([-0.05, 0.02, 0.1])
+        )
+        wide = geometry.make_pose(
+            geometry.exp_so3(np.array([0.3, -0.2, 0.1])), np.array([0.1, 0.1, 2.2])
+        )
+        focal = (1500.0, 1510.0)
+        some = cls(unknown=cls.allowed_unknown, focal=focal, corners=(3, 2), square=0.1)
+        return (
+            cls(T_camera=ahead),
+            replace(some, T_camera=ahead, T_board=board, lens="phone", camera="left"),
+            replace(some, T_board=wide, mount="camera"),
+        )
+
+    @property
+    def columns(self) -> tuple[Column, ...]:
+        """The number of the corner, and its pixels."""
+        return (Column("corner", Dimension.COUNT), *self.noise_columns)
+
+    @property
+    def noise_columns(self) -> tuple[Column, ...]:
+        """The pixels."""
+        return Column("u", Dimension.PIXEL), Column("v", Dimension.PIXEL)
+
+    @property
+    def target_columns(self) -> Mapping[str, tuple[int, ...]]:
+        """The board, with the indices of its pixels."""
+        return {self.board: (1, 2)}
+
+    @property
+    def rows_per_pose(self) -> int:
+        """Number of corners."""
+        return self.corners[0] * self.corners[1]
+
+    @property
+    def nominal_lens(self) -> FloatArray:
+        """The stated lens (9,), in the order of `LENS`."""
+        width, height = self.size
+        focal = self.focal or (float(width), float(width))
+        center = self.center or (0.5 * (width - 1), 0.5 * (height - 1))
+        return np.array([*focal, *center, *self.distortion])
+
+    @cached_property
+    def possible_setup(self) -> Mapping[str, setup.SetupItem]:
+        """The poses of camera and board, the lens, and the print."""
+        numbers = dict(zip(LENS, self.nominal_lens.tolist(), strict=True))
+        lens, pixel, ratio = self.lens or self.camera, Dimension.PIXEL, Dimension.RATIO
+        items = {
+            item: setup.SetupItem(
+                tuple(
+                    Parameter(
+                        f"{lens}.{n}",
+                        pixel if n in LENS[:4] else ratio,
+                        numbers[n],
+                        scope="session",
+                    )
+                    for n in names
+                )
+            )
+            for item, names in LENS_ITEMS.items()
+        }
+        return {
+            "camera": setup.make_frame_item(self.camera, self.T_camera),
+            "board": setup.make_frame_item(self.board, self.T_board),
+            **items,
+            "print": setup.SetupItem(setup.make_parameters(self.board, PRINT, ratio)),
+            "bend": setup.SetupItem(setup.make_parameters(self.board, BEND, Dimension.LENGTH)),
+        }
+
+    def list_labels(self, r: int) -> FloatArray:
+        """Return the corners (r, 1): all of them, again and again."""
+        return (np.arange(r) % self.rows_per_pose)[:, None].astype(float)
+
+    def name_label(self, columns: FloatArray) -> str:
+        """Return the corner of a row (c,) in words."""
+        return f"corner {columns[0]:.0f}"
+
+    def detect_present(self, measured: FloatArray) -> BoolArray:
+        """Return which pixels exist."""
+        return ~np.isnan(measured[..., 1:] + measured[..., :1])
+
+    def find_invalid_rows(self, measured: FloatArray) -> InvalidRows:
+        """Return rows of a corner that the board does not have."""
+        corner, count = measured[:, 0], self.rows_per_pose
+        is_one = (corner >= 0) & (corner < count) & (corner == np.round(corner))
+        is_one |= np.isnan(measured[:, 1:]).all(axis=1) & np.isnan(corner)
+        return list_rows(
+            ~is_one,
+            lambda i: (
+                f"has the corner {corner[i]:g}, but the corners of the board are 0 to {count - 1}. "
+                "Correct it, or the setting 'corners'"
+            ),
+        )
+
+    def hide_unseen(self, T: FloatArray, columns: FloatArray, values: FloatArray) -> FloatArray:
+        """Return columns (t, r, 3) without corners outside the picture, behind the camera, or on a
+        board that is seen from behind or at a grazing angle.
+        """
+        camera_board = self._locate_board(T, self._unite(values))
+        arm, normal = camera_board[..., :3, 3], camera_board[..., :3, 2]
+        p = self._list_points(columns[..., 0].astype(np.intp), self._unite(values))[0]
+        x = (camera_board[..., :3, :3] @ p[..., None])[..., 0] + arm
+        facing = (normal * x).sum(axis=-1) > GRAZING * np.linalg.norm(x, axis=-1)
+        # beyond the largest angle of a picture the polynomial of the distortion may come back
+        reach = 1.5 * np.linalg.norm(self.size) / self.nominal_lens[:2].min()
+        ahead = np.linalg.norm(x[..., :2], axis=-1) < reach * x[..., 2]
+        inside = ((columns[..., 1:] >= 0.0) & (columns[..., 1:] < self.size)).all(axis=-1)
+        seen = np.concatenate(
+            [np.ones_like(x[..., :1]), np.repeat((inside & facing & ahead)[..., None], 2, -1)], -1
+        )
+        return np.where(seen > 0.0, columns, np.nan)
+
+    def _unite(self, values: FloatArray) -> FloatArray:
+        """Return values (t, 1, u) where all rows have the same, as they mostly have."""
+        is_one = values.shape[1] == 1 or (values == values[:, :1]).all()
+        return values[:, :1] if is_one else values
+
+    def _place(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return camera and board (.., 4, 4) in the bodies that carry them."""
+        of_camera, of_board = (self.item_values(values, name) for name in ("camera", "board"))
+        return setup.place_frame(self.T_camera, of_camera), setup.place_frame(
+            self.T_board, of_board
+        )
+
+    def _locate_board(self, T: FloatArray, values: FloatArray) -> FloatArray:
+        """Return T_camera_board (.., 4, 4)."""
+        camera, board = self._place(values)
+        moved = T if self.mount == "board" else geometry.invert_pose(T)
+        return geometry.invert_pose(camera) @ (moved @ board)
+
+    def _list_points(
+        self, corner: IntArray, values: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return points (.., 3) of corners on the board, x and y as designed (.., 2), and the
+        shapes (.., 3) of the bends.
+        """
+        columns, rows = self.corners
+        place = np.stack([corner % columns, corner // columns], axis=-1).astype(float)
+        h, k = np.moveaxis(2.0 * place / np.array([columns - 1, rows - 1]) - 1.0, -1, 0)
+        shapes, flat = np.stack([h * h, k * k, h * k], axis=-1), place * self.square
+        scale, bend = (self.stated_or_unknown(values, name) for name in ("print", "bend"))
+        height = (shapes * bend).sum(axis=-1, keepdims=True)
+        scaled = np.broadcast_to(flat * (1.0 + scale), (*height.shape[:-1], 2))
+        return np.concatenate([scaled, height], axis=-1), flat, shapes
+
+    @cached_property
+    def _stated_points(self) -> FloatArray:
+        """The points (corners, 3) of the board as stated."""
+        corner = np.arange(self.rows_per_pose)
+        return self._list_points(corner, self.nominal_values[None, None])[0].reshape(-1, 3)
+
+    def _find_lens(self, values: FloatArray) -> FloatArray:
+        """Return the lens (.., 9)."""
+        parts = [self.stated_or_unknown(values, name) for name in LENS_ITEMS]
+        shape = np.broadcast_shapes(*(part.shape[:-1] for part in parts))
+        return np.concatenate([np.broadcast_to(p, (*shape, p.shape[-1])) for p in parts], axis=-1)
+
+    def _predict(self, T: FloatArray, values: FloatArray, joints: FloatArray) -> Evaluation:
+        raise NotImplementedError
+
+    def _measure(
+        self, T: FloatArray, noise: FloatArray, values: FloatArray, joints: FloatArray
+    ) -> FloatArray:
+        """Return corners and pixels (t, r, 3); the noise (t, r, 3) begins with the corners."""
+        values, corner = self._unite(values), noise[..., 0].astype(np.intp)
+        p, C = self._list_points(corner, values)[0], self._locate_board(T, values)
+        x = (C[..., :3, :3] @ p[..., None])[..., 0] + C[..., :3, 3]
+        pixels = project(x, self._find_lens(values), False)[0] + noise[..., 1:]
+        label = np.broadcast_to(noise[..., :1], (*pixels.shape[:-1], 1))
+        return np.concatenate([label, pixels], axis=-1)
+
+    def _evaluate(
+        self, T: FloatArray, measured: FloatArray, values: FloatArray, joints: FloatArray
+    ) -> Evaluation:
+        """Return the residuals. With g the derivative of a pixel by a point of the carrier of the
+        camera, a twist (w, v) of the board about an origin at a distance a changes the pixel by
+        `w.(a x g) + v.g`, and one of the camera by the opposite.
+        """
+        values = self._unite(values)
+        p, flat, shapes = self._list_points(measured[..., 0].astype(np.intp), values)
+        camera, board = self._place(values)
+        F, B, R = camera[..., :3, :3], board[..., :3, :3], T[..., :3, :3]
+        arm = (B @ p[..., None])[..., 0]  # of the board, in axes of the body that carries it
+        q = arm + board[..., :3, 3]
+        if self.mount == "board":
+            lever = (R @ q[..., None])[..., 0]
+            y = lever + T[..., :3, 3]
+        else:
+            lever = q - T[..., :3, 3]
+            y = (np.swapaxes(R, -1, -2) @ lever[..., None])[..., 0]
+        z = y - camera[..., :3, 3]
+        x = (np.swapaxes(F, -1, -2) @ z[..., None])[..., 0]
+        pixels, by_point, by_lens = project(x, self._find_lens(values))
+        by_y = by_point @ np.swapaxes(F, -1, -2)
+        on_board = by_y @ (R if self.mount == "board" else np.swapaxes(R, -1, -2))
+        by_twist = _turn(lever, by_y) if self.mount == "board" else -_turn(lever, on_board)
+        blocks = {"twist": by_twist}
+        if (of_camera := self.item_values(values, "camera")) is not None:
+            blocks["camera"] = -_turn(z, by_y) @ setup.linearize_frame(of_camera)
+        if (of_board := self.item_values(values, "board")) is not None:
+            blocks["board"] = _turn(arm, on_board) @ setup.linearize_frame(of_board)
+        by_p = on_board @ B
+        blocks["print"] = by_p[..., :2] * flat[..., None, :]
+        blocks["bend"] = by_p[..., 2:] * shapes[..., None, :]
+        for item, names in LENS_ITEMS.items():
+            first = LENS.index(names[0])
+            blocks[item] = by_lens[..., first : first + len(names)]
+        blocks = {k: b for k, b in blocks.items() if k == "twist" or k in self.own_items}
+        residual = pixels - measured[..., 1:]
+        return self.split_columns(residual, self.join_columns(blocks, residual.shape))
+
+    # Start values.
+
+    def list_pictures(self, T: FloatArray, measured: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the poses (n, 4, 4) and pixels (n, corners, 2) of pictures, NaN where absent, from
+        rows of any order: rows of one pose, and of two pictures where a corner occurs twice.
+        """
+        _, of_pose = np.unique(T.reshape(len(T), -1), axis=0, return_inverse=True)
+        corner = measured[:, 0].astype(np.intp)
+        key = of_pose.ravel() * self.rows_per_pose + corner
+        order = np.argsort(key, kind="stable")
+        again = np.zeros(len(key), dtype=np.intp)
+        again[order] = np.arange(len(key)) - np.searchsorted(key[order], key[order])
+        _, first, picture = np.unique(
+            np.column_stack([of_pose.ravel(), again]),
+            axis=0,
+            return_index=True,
+            return_inverse=True,
+        )
+        pixels = np.full((len(first), self.rows_per_pose, 2), np.nan)
+        pixels[picture.ravel(), corner] = measured[:, 1:]
+        return T[first], pixels
+
+    def guess_values(self, T: FloatArray, measured: FloatArray) -> FloatArray:
+        """Return the lens by Zhang's closed form and all pictures, the board in each picture, and
+        from these camera and board on their bodies.
+        """
+        T, pixels = self.list_pictures(T, measured)
+        chosen = np.flatnonzero(shows_board(self._stated_points, pixels))
+        if not self.own_items or len(chosen) < 2:
+            return self.nominal_values[None]
+        chosen = chosen[choose_evenly(len(chosen), PICTURES)]
+        T, pixels = T[chosen], pixels[chosen]
+        candidates = [
+            self.assemble_values(of_lens | of_frames)
+            for of_lens, poses in self._guess_lenses(pixels)
+            for of_frames in self._guess_frames(T, poses)
+        ]
+        return np.concatenate(candidates)
+
+    def _guess_lenses(self, pixels: FloatArray) -> list[tuple[dict[str, FloatArray], FloatArray]]:
+        """Return values of the items of the lens, and T_camera_board (n, 4, 4) with each."""
+        points = self._stated_points
+        lens, free = self.nominal_lens, np.zeros(len(LENS), dtype=bool)
+        found = [(lens, locate_boards(points, pixels, lens))]
+        for item in (item for item in LENS_ITEMS if item in self.unknown):
+            free |= np.isin(LENS, LENS_ITEMS[item])
+        starts = [lens] if free.any() else []
+        if "focal" in self.unknown:
+            focal = solve_focal_lengths(points, pixels, lens[2:4])
+            if focal is not None:
+                closed = np.concatenate([focal, lens[2:]])
+                starts.append(closed)
+                found.append((closed, locate_boards(points, pixels, closed)))
+        for start in starts:
+            fit = calibrate_camera(points, pixels, start, free)
+            # pictures that do not determine a lens leave it anywhere
+            if np.isfinite(fit.lens).all() and fit.lens[:2].min() > 0.0:
+                found.append((fit.lens, fit.poses))
+        items = {name: [LENS.index(n) for n in names] for name, names in LENS_ITEMS.items()}
+        return [({name: of[i] for name, i in items.items()}, poses) for of, poses in found]
+
+    def _guess_frames(self, T: FloatArray, poses: FloatArray) -> list[dict[str, FloatArray]]:
+        """Return values of camera and board, from T_base_platform and T_camera_board (n, 4, 4)."""
+        # on the fixed body a frame, on the platform a tool: frame measured = T tool
+        fixed, carried = ("camera", "board") if self.mount == "board" else ("board", "camera")
+        measured = poses if self.mount == "board" else geometry.invert_pose(poses)
+        stated = {"camera": self.T_camera, "board": self.T_board}
+        known = [name not in self.unknown for name in (fixed, carried)]
+        if all(known):
+            return [{}]
+        pairs = []
+        if not any(known):
+            # four points about the tool, as far apart as the camera is away
+            size = float(np.median(np.linalg.norm(poses[:, :3, 3], axis=1)))
+            q = size * np.concatenate([np.zeros((1, 3)), np.eye(3)])
+            seen = (measured[:, None, :3, :3] @ q[..., None])[..., 0] + measured[:, None, :3, 3]
+            moving = (T[:, None, :3, None, :3] * np.eye(4)[:, None, :, None]).reshape(-1, 3, 12)
+            origin = np.repeat(T[:, :3, 3], 4, axis=0)
+            frames, places = solve_frame_and_points(seen.reshape(-1, 3), moving, origin)
+            tools = [align_point_sets(q, of.reshape(4, 3)) for of in places]
+            pairs += list(zip(frames, tools, strict=True))
+        for frame, tool in ((None, stated[carried]), (stated[fixed], None)):
+            if (frame is None and not known[0]) or (tool is None and not known[1]):
+                pairs.append(solve_hand_eye(T, measured, frame, tool))
+        return [
+            {
+                name: setup.encode_frame(stated[name], of)
+                for name, of in ((fixed, frame), (carried, tool))
+            }
+            for frame, tool in pairs
+        ]
+
+
+def _turn(arm: FloatArray, slope: FloatArray) -> FloatArray:
+    """Return derivatives (.., 2, 6) by a twist about an origin from which the point is at `arm`
+    (.., 3), from those by the point (.., 2, 3): `[a x g, g]`.
+    """
+    by_turn = np.cross(arm[..., None, :], slope)
+    return np.concatenate([by_turn, np.broadcast_to(slope, by_turn.shape)], axis=-1)

@@ -1,0 +1,216 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pictures of a printed board: the projection is written here a second time, in plain loops."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from loopcal import geometry, load_robot
+from loopcal.errors import DataError, LoopcalError
+from loopcal.io.data.measurement_file import load_measurements
+from loopcal.io.data.measurement_writer import save_measurements
+from loopcal.measure.camera_geometry import (
+    calibrate_camera,
+    find_rays,
+    locate_boards,
+    project,
+    solve_focal_lengths,
+)
+from loopcal.measure.instrument import Gaussian, Instrument, Sensor
+from loopcal.measure.kinds.image import Image
+from loopcal.measure.simulation import simulate
+
+LENS_VALUES = np.array([3000.0, 3100.0, 2000.0, 1500.0, 0.1, -0.2, 0.05, 0.001, -0.002])
+BOARD = np.array([[0.02 * (i % 9), 0.02 * (i // 9), 0.0] for i in range(54)])
+
+
+def project_by_hand(x, y, z, lens):
+    """The formulas of OpenCV's documentation, for one point."""
+    fx, fy, cx, cy, k1, k2, k3, p1, p2 = lens
+    a, b = x / z, y / z
+    r2 = a**2 + b**2
+    radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+    u = a * radial + 2 * p1 * a * b + p2 * (r2 + 2 * a**2)
+    v = b * radial + p1 * (r2 + 2 * b**2) + 2 * p2 * a * b
+    return fx * u + cx, fy * v + cy
+
+
+def draw_pictures(n=12, seed=0):
+    """Return poses (n, 4, 4) of a board in front of a camera, and its exact pixels (n, 54, 2)."""
+    rng = np.random.default_rng(seed)
+    R = geometry.exp_so3(rng.uniform(-0.6, 0.6, (n, 3)))
+    t = rng.uniform([-0.15, -0.1, 0.4], [-0.05, 0.0, 0.6], (n, 3))
+    pixels = [
+        [project_by_hand(*(of @ p + at), LENS_VALUES) for p in BOARD]
+        for of, at in zip(R, t, strict=True)
+    ]
+    return geometry.make_pose(R, t), np.array(pixels)
+
+
+def test_projection_and_its_slopes_agree_with_plain_formulas_and_complex_steps() -> None:
+    x = np.random.default_rng(1).normal(size=(7, 3)) * 0.3 + [0.0, 0.0, 1.0]
+    pixels, by_point, by_lens = project(x, LENS_VALUES)
+    expected = [project_by_hand(*point, LENS_VALUES) for point in x]
+    np.testing.assert_allclose(pixels, expected, atol=1e-9)  # [px], rounding of 3000 px
+    step = 1e-30
+    for i, d in enumerate(np.eye(3)):
+        moved = project(x + 1j * step * d, LENS_VALUES.astype(complex), False)[0].imag / step
+        np.testing.assert_allclose(by_point[..., i], moved, rtol=1e-12, atol=1e-8)
+    for i, d in enumerate(np.eye(9)):
+        moved = project(x.astype(complex), LENS_VALUES + 1j * step * d, False)[0].imag / step
+        np.testing.assert_allclose(by_lens[..., i], moved, rtol=1e-12, atol=1e-8)
+    np.testing.assert_allclose(find_rays(pixels, LENS_VALUES), x / x[:, 2:], atol=1e-12)
+
+
+def test_point_beside_or_behind_the_camera_has_a_finite_residual() -> None:
+    x = np.array([[0.1, 0.2, -1.0], [0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
+    assert all(np.isfinite(part).all() for part in project(x, LENS_VALUES))
+
+
+def test_pose_of_a_board_follows_from_one_picture() -> None:
+    poses, pixels = draw_pictures()
+    np.testing.assert_allclose(locate_boards(BOARD, pixels, LENS_VALUES), poses, atol=1e-9)
+
+
+def test_focal_lengths_follow_in_closed_form_without_distortion() -> None:
+    poses, _ = draw_pictures()
+    lens = np.where(np.arange(9) < 4, LENS_VALUES, 0.0)
+    x = (poses[:, None, :3, :3] @ BOARD[..., None])[..., 0] + poses[:, None, :3, 3]
+    pixels = project(x, lens)[0]
+    np.testing.assert_allclose(solve_focal_lengths(BOARD, pixels, lens[2:4]), lens[:2], rtol=1e-8)
+    level = np.tile(geometry.make_pose(np.eye(3), np.array([-0.1, 0.0, 0.5])), (4, 1, 1))
+    x = (level[:, None, :3, :3] @ BOARD[..., None])[..., 0] + level[:, None, :3, 3]
+    assert solve_focal_lengths(BOARD, project(x, lens)[0], lens[2:4]) is None
+
+
+@pytest.mark.slow
+def test_camera_alone_is_calibrated_within_its_stated_uncertainty() -> None:
+    _, exact = draw_pictures()
+    start = np.array([np.nan, np.nan, 1990.0, 1510.0, *[0.0] * 5])
+    errors = []
+    for seed in range(12):
+        pixels = exact + 0.2 * np.random.default_rng(seed).standard_normal(exact.shape)
+        pixels[3, :10] = np.nan
+        fit = calibrate_camera(BOARD, pixels, start, np.ones(9, dtype=bool))
+        errors.append((fit.lens - LENS_VALUES) / fit.sd)
+        assert fit.sigma == pytest.approx(0.2, rel=0.08)  # four standard deviations of it
+    # 108 correlated values: the mean square of a lens parameter is 1 +- 0.41
+    assert np.mean(np.square(errors)) == pytest.approx(1.0, abs=0.5)
+
+
+def test_pictures_with_too_few_corners_are_refused() -> None:
+    _, pixels = draw_pictures(3)
+    pixels[1, 9:] = np.nan  # a row of corners: on a line
+    with pytest.raises(DataError, match="picture 2 shows too little"):
+        calibrate_camera(BOARD, pixels, LENS_VALUES, np.zeros(9, dtype=bool))
+
+
+def test_corners_of_the_kind_are_those_of_the_plain_formulas() -> None:
+    """Board on the platform and camera on the base, and the reverse, with print and bend."""
+    rng = np.random.default_rng(5)
+    T, camera, board = geometry.apply_twist(np.eye(4), rng.uniform(-0.2, 0.2, (3, 6)))
+    camera[2, 3] -= 1.0
+    stated = {"focal": (3000.0, 3100.0), "center": (2000.0, 1500.0), "corners": (4, 3)}
+    kind = Image(
+        T_camera=camera,
+        T_board=board,
+        distortion=tuple(LENS_VALUES[4:]),
+        unknown=("print", "bend"),
+        **stated,
+    )
+    values = np.array([0.01, -0.02, 0.003, 0.001, -0.002])
+    sx, sy, bx, by, bxy = values
+    for mount in ("board", "camera"):
+        found = replace(kind, mount=mount).measure(
+            np.tile(T, (1, 12, 1, 1)), np.zeros((1, 12, 2)), values[None, None]
+        )[0]
+        for i in range(12):
+            column, row = i % 4, i // 4
+            h, k = column / 1.5 - 1.0, row / 1.0 - 1.0
+            p = [
+                column * 0.02 * (1 + sx),
+                row * 0.02 * (1 + sy),
+                bx * h**2 + by * k**2 + bxy * h * k,
+                1,
+            ]
+            body = T if mount == "board" else np.linalg.inv(T)
+            x = (np.linalg.inv(camera) @ body @ board @ p)[:3]
+            np.testing.assert_allclose(found[i, 1:], project_by_hand(*x, LENS_VALUES), atol=1e-8)
+
+
+def look_down(height):
+    return geometry.make_pose(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, height]))
+
+
+def make_kind(**settings):
+    """Return a board that lies on the platform, seen by a camera 0.5 m above it."""
+    usual = {"corners": (5, 4), "square": 0.02, "focal": (4000.0, 4000.0)}
+    board = geometry.make_pose(np.diag([1.0, -1.0, -1.0]), np.array([-0.04, 0.03, 0.01]))
+    return Image(**(usual | {"T_camera": look_down(0.7), "T_board": board} | settings))
+
+
+def make_poses(n=6, seed=3):
+    low, high = np.array([-20, -20, 190, -8, -8, -8]), np.array([20, 20, 210, 8, 8, 8])
+    return np.random.default_rng(seed).uniform(low, high, (n, 6)) * np.repeat(
+        [1e-3, np.pi / 180], 3
+    )
+
+
+def test_file_of_two_cameras_assigns_rows_by_the_columns_camera_and_board(tmp_path) -> None:
+    robot = load_robot("hexapod-42")
+    kinds = [make_kind(camera=name, lens="phone", unknown=("camera",)) for name in ("a", "b")]
+    sensors = [Sensor(kind, Gaussian(np.full(2, 0.1))) for kind in kinds]
+    data = simulate(robot, make_poses(), Instrument(tuple(sensors)), 0)
+    save_measurements(data, path := tmp_path / "data.csv", robot)
+    text = path.read_text()
+    loaded = load_measurements(path, robot)
+    for old, new in zip(data.observations, loaded.observations, strict=True):
+        np.testing.assert_allclose(new.measured, old.measured)
+        assert (new.kind.camera, new.kind.lens) == (old.kind.camera, "phone")
+    # the same with the columns of the cameras in place of the labels of the kinds
+    named = text.replace("kind,", "camera,").replace(",image-1,", ",a,").replace(",image-2,", ",b,")
+    path.write_text(named)
+    again = load_measurements(path, robot)
+    for old, new in zip(loaded.observations, again.observations, strict=True):
+        np.testing.assert_array_equal(new.measured, old.measured)
+    path.write_text(named.replace(",b,", ",c,"))
+    with pytest.raises(LoopcalError, match="no kind has camera 'c'"):
+        load_measurements(path, robot)
+    path.write_text(named.replace(",19,", ",20,"))
+    with pytest.raises(LoopcalError, match="has the corner 20, but the corners of the board are 0"):
+        load_measurements(path, robot)
+
+
+def test_lens_may_hold_in_all_sessions(tmp_path) -> None:
+    robot = load_robot("hexapod-42")
+    kind = make_kind(unknown=("camera", "focal"))
+    data = simulate(robot, make_poses(), Instrument((Sensor(kind, Gaussian(np.full(2, 0.1))),)), 0)
+    rows = data.observations[0]
+    data = replace(
+        data, observations=(replace(rows, session=np.where(rows.rows < 3, "one", "two")),)
+    )
+    save_measurements(data, path := tmp_path / "data.csv", robot)
+    names = load_measurements(path, robot).nuisance_parameters.table.names
+    assert {"one.camera.fx", "two.camera.fx", "one.camera.x"} <= set(names)
+    path.write_text('# unknowns: {"*.f?": {scope: all}}\n' + path.read_text())
+    names = load_measurements(path, robot).nuisance_parameters.table.names
+    assert "camera.fx" in names
+    assert "one.camera.fx" not in names
+
+
+def test_simulation_hides_what_a_camera_does_not_see() -> None:
+    robot, noise = load_robot("hexapod-42"), Gaussian(np.full(2, 0.1))
+    part = make_kind(focal=(9000.0, 9000.0), square=0.05)
+    rows = simulate(robot, make_poses(), Instrument((Sensor(part, noise),)), 0).observations[0]
+    assert 0.1 < rows.is_measured.mean() < 0.9
+    seen = rows.measured[rows.is_measured]
+    assert (seen[:, 1:].min() >= 0.0, seen[:, 1].max() < 4000, seen[:, 2].max() < 3000) == (
+        True,
+        True,
+        True,
+    )
+    for wrong in ({"T_board": np.eye(4)}, {"T_camera": geometry.make_pose(np.eye(3), np.zeros(3))}):
+        kind = make_kind(**wrong)
+        with pytest.raises(DataError, match="sees nothing at any pose"):
+            simulate(robot, make_poses(), Instrument((Sensor(kind, noise),)), 0)
