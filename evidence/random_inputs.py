@@ -13,6 +13,7 @@ from typing import Any
 from tools.fuzz.campaign import Summary, run_campaign
 from tools.fuzz.cases import Maker
 from tools.fuzz.corpus import build_corpus
+from tools.fuzz.study_corpus import build_study_corpus
 
 INPUTS, SEED = 5000, 1_000_001
 LONG_RUN = Path(__file__).with_name("random_inputs_longest.json")
@@ -30,7 +31,8 @@ def check(tables: dict[str, Any]) -> None:
 def collect() -> dict[str, Any]:
     """Return the counts of this run, and the tables of these and of the longest one."""
     summary = Summary()
-    run_campaign(Maker(build_corpus()), iter(range(SEED, SEED + INPUTS)), 1, summary, _ignore)
+    maker = Maker([*build_corpus(), *build_study_corpus()])
+    run_campaign(maker, iter(range(SEED, SEED + INPUTS)), 1, summary, _ignore)
     counts = summary.to_json()
     return {"counts": counts, "finds": counts["finds"], "tables": make_tables(counts)}
 

@@ -16,6 +16,7 @@ import pytest
 import loopcal as lc
 from loopcal.cli.entry_point import main
 from loopcal.report.pictures import _render_svg
+from tests.findings.expectations import expect_refusal
 
 DRAW = "--draw 16 --kind position --sigma-position 10um"
 
@@ -169,6 +170,20 @@ def test_a_run_that_states_no_units_is_shown_without_intervals(loopcal, runs, tm
     assert loopcal(f"may {older}").err == ""
     summary = lc.compare_runs([lc.load_run(runs / "may"), lc.load_run(older)]).runs[1]
     assert set(summary.plus_minus.values()) == {None}
+
+
+@pytest.mark.parametrize("change", ["missing key", "list", "text", "number"])
+def test_a_run_with_another_validation_is_refused_by_name(runs, tmp_path, change) -> None:
+    damaged = tmp_path / "damaged"
+    shutil.copytree(runs / "june", damaged)
+    result = json.loads((damaged / "result.json").read_text("utf-8"))
+    if change == "missing key":
+        del result["validation"]["after"]["position"]["targets"]
+    else:
+        result["validation"] = {"list": [1], "text": "x", "number": 1.5}[change]
+    (damaged / "result.json").write_text(json.dumps(result), "utf-8")
+    with expect_refusal("files.run-damaged", lc.FileError):
+        lc.compare_runs([lc.load_run(runs / "may"), lc.load_run(damaged)])
 
 
 HOSTILE = "<script>alert(1)</script>=1+1\x1b[31m$\\frac{"

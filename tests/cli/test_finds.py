@@ -109,6 +109,24 @@ FINDS = {
         {"r.urdf": URDF, "c.yaml": "closed_loop: [[[aj], bj]]\ntype: ['6d']\nname_mot: [aj]\n"},
         "must be the names of two frames",
     ),
+    "repeatability of poses that are measured once": (
+        "repeatability linear-delta d.csv",
+        {"d.csv": POSITION + ROWS},
+        "loopcal: linear-delta and d.csv: Repeatability needs several visits",
+    ),
+    "frame that no robot has": (
+        "new gough -o new.yaml --frames position",
+        {},
+        "loopcal: gough: 'position' is not a frame that can be unknown",
+    ),
+    "sheet without its names of poses": (
+        "fill linear-delta s.csv e.txt --profile spatial-analyzer -o new.csv",
+        {
+            "e.txt": "A, G, 1_T, 1, 2, 3\n",
+            "s.csv": POSITION.replace("pose,", "") + "180,190,200,,,\n",
+        },
+        "s.csv:3: no column 'pose', which the points of an export are joined with. Add it\n",
+    ),
 }
 """Case -> a command line, the files that it reads, and what it says."""
 

@@ -102,7 +102,7 @@ def test_commands_import_only_what_they_need(tmp_path) -> None:
 @pytest.mark.parametrize(
     ("error", "sentence"),
     [
-        (lc.MechanismError("two\n  lines"), "loopcal: two lines\n"),
+        (lc.MechanismError("two\n  lines"), "loopcal: hexapod-42: two lines\n"),
         (KeyboardInterrupt(), "loopcal: stopped before the end, and loopcal wrote no result.\n"),
         (
             PermissionError(13, "Permission denied", "run"),

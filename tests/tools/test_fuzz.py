@@ -10,13 +10,16 @@ from random import Random
 import pytest
 
 from loopcal.cli.commands.study_commands import study
+from loopcal.studies.files.store import NAME, StoreHeader, make_store
 from tools.fuzz.campaign import join_ranges
 from tools.fuzz.cases import Case, Maker
 from tools.fuzz.commands import describe, draw_options, list_commands, name_command
 from tools.fuzz.corpus import build_corpus
 from tools.fuzz.execution import Outcome
+from tools.fuzz.stores import mutate_store
 from tools.fuzz.study_corpus import LINES
-from tools.fuzz.verdict import find_place, judge
+from tools.fuzz.texts import DIRECTIVES, MUTATIONS, TAGS
+from tools.fuzz.verdict import find_place, judge, judge_surroundings
 
 
 @pytest.fixture(scope="module")
@@ -65,18 +68,23 @@ def answer(code, out="", err="", before=(), after=()) -> Outcome:
     ("outcome", "rules"),
     [
         (answer(1, err="loopcal: robot.yaml:3: no.\nHint: write 3\n"), []),
-        (answer(1, err="Warning: x\n"), ["message-form"]),
-        (answer(1, err="loopcal: \x1b[31mred\n"), ["control-character"]),
+        (answer(1, err="loopcal: this is wrong.\nHint: see loopcal x --help\n"), ["no-name"]),
+        (answer(1, err="loopcal: use --force.\n"), []),
+        (answer(1, err="Warning: robot.yaml\n"), ["message-form"]),
+        (answer(1, err="loopcal: \x1b[31mrobot.yaml\n"), ["control-character"]),
         (answer(1), ["no-message"]),
-        (answer(3, err="loopcal: no\n"), ["exit-code"]),
-        (answer(1, err="loopcal: no\n", after={"out": b"1"}), ["left-output"]),
-        (answer(1, err="loopcal: no\n", before={"a": b"1"}), ["deleted-file"]),
-        (answer(1, err="loopcal: n\n", before={"a": b"1"}, after={"a": b"2"}), ["changed-file"]),
-        (answer(1, err="loopcal: <class 'float'>\n"), ["internal-words"]),
+        (answer(3, err="loopcal: robot.yaml\n"), ["exit-code"]),
+        (answer(1, err="loopcal: robot.yaml\n", after={"out": b"1"}), ["left-output"]),
+        (answer(1, err="loopcal: robot.yaml\n", before={"a": b"1"}), ["deleted-file"]),
+        (
+            answer(1, err="loopcal: robot.yaml\n", before={"a": b"1"}, after={"a": b"2"}),
+            ["changed-file"],
+        ),
+        (answer(1, err="loopcal: robot.yaml <class 'float'>\n"), ["internal-words"]),
         (answer(0, out="error: nan mm\n"), ["no-number", "non-finite"]),
         (answer(0, out="information\n"), []),
-        (answer(1, err="loopcal: a gap of unknown mm stays open\n"), ["no-number"]),
-        (answer(1, err="loopcal: a.csv:1: '-inf um' is not finite\n"), []),
+        (answer(1, err="loopcal: robot.yaml: a gap of unknown mm\n"), ["no-number"]),
+        (answer(1, err="loopcal: robot.yaml:1: '-inf um' is not finite\n"), []),
         (answer(0, out='{"text": "it is -inf deg"}\n'), ["no-number", "non-finite"]),
         (answer(0, after={"a.csv": b"x\ninf\n"}), ["non-finite"]),
         (answer(0, after={"a.json": b"{"}), ["unreadable"]),
@@ -87,6 +95,39 @@ def answer(code, out="", err="", before=(), after=()) -> Outcome:
 def test_answers_that_break_a_rule_are_finds(tmp_path, outcome, rules) -> None:
     case = Case(1, "five-bar", ["check", "robot.yaml"], {})
     assert [find.rule for find in judge(case, outcome, tmp_path)] == rules
+
+
+def test_answer_that_depends_on_files_or_variables_of_others_is_a_find() -> None:
+    case = Case(1, "m", ["check"], {}, foreign={"matplotlibrc": b"x"}, variables={"TZ": "x"})
+    both = {"robot.yaml": b"1"}
+    foreign = {"matplotlibrc": b"x"}
+    plain, same = answer(0, "a", after=both), answer(0, "a", after=both | foreign)
+    assert judge_surroundings(case, same, plain) == []
+    for other, what in (
+        (answer(1, "a", after=both), "exit code"),
+        (answer(0, "b", after=both), "stdout"),
+        (answer(0, "a", after={"robot.yaml": b"2"}), "file .yaml"),
+        (answer(0, "a", after=both | {"new.csv": b""}), "file .csv"),
+    ):
+        (find,) = judge_surroundings(case, other, plain)
+        assert find.signature == f"surroundings: ['check'] {what}"
+
+
+def test_tables_values_and_bits_of_a_store_are_damaged(tmp_path) -> None:
+    header = StoreHeader("{}", ("a",), {})
+    make_store(tmp_path, header)
+    content = (tmp_path / NAME).read_bytes()
+    damages = [mutate_store(content, Random(seed)) for seed in range(200)]
+    assert {damage[1] for damage in damages if damage} == {"schema", "value"}
+    assert sum(damage is not None and damage[0] != content for damage in damages) > 60
+    assert any(damage and b"TRIGGER" in damage[0] for damage in damages)
+
+
+def test_every_tag_and_directive_is_written_where_a_value_begins() -> None:
+    text = b"# a: [1, 2]\n# b: {c: 3}\nx,y\n1,2\n"
+    written = [MUTATIONS["tag"](text, Random(seed)) for seed in range(2000)]
+    for word in (*TAGS, *DIRECTIVES):
+        assert any(word.encode() in changed for changed in written)
 
 
 def test_traceback_is_known_by_its_innermost_function_of_loopcal(tmp_path) -> None:

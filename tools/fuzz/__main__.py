@@ -3,7 +3,7 @@
 
     python -m tools.fuzz --count 1000                 the seeds 1 to 1000
     python -m tools.fuzz --count 1000 --add fuzz.json  the next 1000, counted with the earlier ones
-    python -m tools.fuzz --count 1000 --studies       the same for study files and folders
+    python -m tools.fuzz --count 1000 --studies       only study files and folders
     python -m tools.fuzz --replay 4711                one input: its files, command line and answer
 
 The exit code is 1 where something is wrong.
@@ -14,6 +14,7 @@ import json
 import shlex
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ from tools.fuzz.cases import Maker
 from tools.fuzz.corpus import build_corpus
 from tools.fuzz.execution import prepare_worker, run_case
 from tools.fuzz.study_corpus import build_study_corpus
-from tools.fuzz.verdict import judge
+from tools.fuzz.verdict import judge, judge_surroundings
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -37,9 +38,9 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--add", type=Path, help="JSON file of counts to write, and to go on from")
     parser.add_argument("--replay", type=int, metavar="SEED", help="run one input and show it")
     parser.add_argument("--keep", type=Path, help="with --replay: folder for its files")
-    parser.add_argument("--studies", action="store_true", help="inputs of `loopcal study`")
+    parser.add_argument("--studies", action="store_true", help="inputs of `loopcal study` alone")
     options = parser.parse_args(arguments)
-    maker = Maker(build_study_corpus() if options.studies else build_corpus())
+    maker = Maker([*([] if options.studies else build_corpus()), *build_study_corpus()])
     if options.replay is not None:
         return replay(maker, options.replay, options.keep)
     summary = Summary()
@@ -103,6 +104,9 @@ def replay(maker: Maker, seed: int, keep: Path | None) -> int:
         folder = Path(base) / "area" / "case"
         outcome = run_case(case, folder)
         finds = judge(case, outcome, folder)
+        if case.foreign or case.variables:
+            plain = run_case(replace(case, foreign={}, variables={}), folder)
+            finds += judge_surroundings(case, outcome, plain)
     print(f"machine {case.machine}: loopcal {shlex.join(case.words)}")
     print(f"damage: {', '.join(case.damage)}")
     print(f"exit code {outcome.code}, {outcome.cpu:.2f} s")

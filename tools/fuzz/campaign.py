@@ -16,7 +16,7 @@ import signal
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,7 @@ from typing import Any
 from tools.fuzz.cases import Case, Maker
 from tools.fuzz.commands import describe, name_command
 from tools.fuzz.execution import CPU_LIMIT, Outcome, prepare_worker, run_case
-from tools.fuzz.verdict import Find, judge
+from tools.fuzz.verdict import Find, judge, judge_surroundings
 
 CHUNK = 100
 """Inputs that one worker runs before it is replaced by a fresh one."""
@@ -115,6 +115,9 @@ def answer_case(case: Case, maker: Maker, folder: Path) -> dict[str, Any]:
     """Run an input and return what is counted about it."""
     outcome = run_case(case, folder)
     finds = judge(case, outcome, folder)
+    if case.foreign or case.variables:
+        plain = run_case(replace(case, foreign={}, variables={}), folder)
+        finds += judge_surroundings(case, outcome, plain)
     return _make_answer(case, maker, outcome, finds)
 
 

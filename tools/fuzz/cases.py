@@ -15,12 +15,17 @@ import click
 from tools.fuzz.arrays import mutate_arrays
 from tools.fuzz.commands import draw_options, draw_value, find_group_command, list_commands
 from tools.fuzz.corpus import Machine, parse_yaml
+from tools.fuzz.stores import mutate_store
+from tools.fuzz.surroundings import draw_surroundings
 from tools.fuzz.tables import Table, mutate_table, read_table, write_table
 from tools.fuzz.texts import mutate_text
 from tools.fuzz.trees import Tree, mutate_tree, write_json, write_yaml
 
-MACHINE_WEIGHTS = {"five-bar": 4, "linear-delta": 4, "exports": 2, "programs": 4}
+MACHINE_WEIGHTS = {"five-bar": 4, "linear-delta": 4, "exports": 2, "programs": 4, "study": 2}
 """How often a machine is drawn, 1 by default. The small ones cost least."""
+
+SURROUNDED = 0.1
+"""Share of the inputs that also run beside files and variables of other programs."""
 
 ODD_PLACES = ("missing", "folder", "fifo", "loop", "link", "empty")
 """What may stand in place of an input file."""
@@ -34,6 +39,7 @@ class Case:
     ----------
     words : command line. files : content by name; a word of ODD_PLACES for what is no file.
     damage : what was done, as `kind of file: mutation`.
+    foreign, variables : files of other programs and variables, which must not change the answer.
     """
 
     seed: int
@@ -41,6 +47,8 @@ class Case:
     words: list[str]
     files: dict[str, bytes | str]
     damage: list[str] = field(default_factory=list)
+    foreign: dict[str, bytes] = field(default_factory=dict)
+    variables: dict[str, str] = field(default_factory=dict)
 
 
 @dataclass
@@ -81,6 +89,9 @@ class Maker:
         damages = rng.choices([0, 1, 2, 3, 6], [6, 60, 20, 10, 4])[0]
         for _ in range(damages if case.damage else max(damages, rng.random() < 0.95)):
             self._mutate_file(case, machine, rng)
+        if rng.random() < SURROUNDED:
+            case.foreign, case.variables = draw_surroundings(rng)
+            case.damage += [f"surroundings: {name}" for name in (*case.foreign, *case.variables)]
         return case
 
     def _mutate_options(self, case: Case, machine: Machine, rng: Random) -> None:
@@ -128,6 +139,8 @@ class Maker:
         times, mutation = rng.choice([1, 1, 1, 2, 3]), ""
         if name.endswith(".npz"):
             return mutate_arrays(machine.files[name], rng)
+        if name.endswith(".sqlite"):
+            return mutate_store(machine.files[name], rng)
         if name in machine.trees:
             tree: Any = machine.trees[name]
             for _ in range(times):

@@ -13,7 +13,7 @@ import click
 
 from loopcal.cli import entry_point
 from loopcal.cli.entry_point import find_command
-from tools.fuzz.values import NAMES
+from tools.fuzz.values import NAMES, WINDOWS_PATHS
 
 COUNTS = ("1", "2", "3", "4", "5", "8", "12", "20")
 """Counts that cost little."""
@@ -110,7 +110,9 @@ def draw_value(
     if isinstance(kind, click.types.FloatParamType) or kind.name == "share":
         return rng.choice(WRONG_SHARES if is_wrong else SHARES)
     if isinstance(kind, click.Path):
-        return rng.choice(PATHS) if is_wrong else rng.choice([*files, *PATHS[:3]])
+        return (
+            rng.choice([*PATHS, *WINDOWS_PATHS]) if is_wrong else rng.choice([*files, *PATHS[:3]])
+        )
     if kind.name == "duration":
         return rng.choice(WRONG_TIMES if is_wrong else TIMES)
     if kind.name == "quantity":

@@ -30,6 +30,7 @@ import click
 from loopcal.cli import entry_point
 from loopcal.errors import LoopcalError
 from tools.fuzz.cases import Case
+from tools.fuzz.surroundings import set_variables
 
 CPU_LIMIT, WAIT_LIMIT = 10.0, 15.0
 """Seconds of processor time of a run, and seconds that it may do nothing but wait."""
@@ -157,7 +158,7 @@ def limited_time() -> Iterator[None]:
 
 def write_case(case: Case, folder: Path) -> None:
     """Write the files of an input."""
-    for name, content in case.files.items():
+    for name, content in (case.files | case.foreign).items():
         path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
         if isinstance(content, bytes):
@@ -201,6 +202,7 @@ def run_case(case: Case, folder: Path) -> Outcome:
     begin = time.process_time()
     with (
         contextlib.chdir(folder),
+        set_variables(case.variables),
         warnings.catch_warnings(record=True) as warned,
         _watched(folder.parent, outcome),
     ):

@@ -11,7 +11,7 @@ from random import Random
 from typing import Any
 
 from tools.fuzz.trees import Tree, mutate_tree, write_yaml
-from tools.fuzz.values import CELLS, change_number, draw_name
+from tools.fuzz.values import CELLS, WINDOWS_PATHS, change_number, draw_name
 
 UNITS = (
     "mm",
@@ -140,6 +140,15 @@ def _delete_column(table: Table, rng: Random) -> None:
         del row[j : j + 1]
 
 
+def _double_column(table: Table, rng: Random) -> None:
+    """Repeat a column beside itself or at the end, with its cells or with others."""
+    _, j = _pick(table, rng)
+    place, other = rng.choice([j, len(table.header)]), rng.choice([None, *VALUES])
+    for row in (table.header, *table.rows):
+        cell = row[j : j + 1] if row is table.header or other is None else [other]
+        row[place:place] = cell
+
+
 def _rename_column(table: Table, rng: Random) -> None:
     """Rename a column or change its unit."""
     _, j = _pick(table, rng)
@@ -208,7 +217,11 @@ def _add_setting(table: Table, rng: Random) -> None:
                 }
             },
             {"noise_source": "assumed"},
-            {"poses": rng.choice(["poses.csv", "data.csv", "/dev/zero", "../x.csv", "."])},
+            {
+                "poses": rng.choice(
+                    [*WINDOWS_PATHS, "poses.csv", "data.csv", "/dev/zero", "../x.csv", "."]
+                )
+            },
             {
                 "controller": rng.choice(
                     ["robot.yaml", "data.csv", "../x.yaml", "/dev/zero", "five-bar"]
@@ -233,6 +246,7 @@ MUTATIONS: dict[str, Callable[[Table, Random], None]] = {
     "fill-column": _fill_column,
     "add-column": _add_column,
     "delete-column": _delete_column,
+    "double-column": _double_column,
     "rename-column": _rename_column,
     "rows": _edit_rows,
     "swap-columns": _swap_columns,

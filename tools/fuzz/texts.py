@@ -7,7 +7,7 @@ import re
 from collections.abc import Callable
 from random import Random
 
-from tools.fuzz.values import CELLS, NAMES, SNIPPETS, change_number
+from tools.fuzz.values import CELLS, NAMES, SNIPPETS, WINDOWS_PATHS, change_number
 
 NUMBER = re.compile(rb"(?<![\w.])[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?(?![\w.])")
 WORD = re.compile(rb"[A-Za-z_][\w.-]*")
@@ -26,6 +26,20 @@ TAILS = (
     b"\n#",
 )
 """Ends of a file."""
+
+
+TAGS = (
+    *("!!bool", "!!int", "!!float", "!!set", "!!omap", "!!pairs", "!!binary", "!!timestamp"),
+    *("!!null", "!!str", "!!seq", "!!map", "!!merge", "!", "!x", "!<tag:yaml.org,2002:int>"),
+    *("!!python/object/apply:os.getcwd", "!!python/name:os.system", "!!ruby/object:x", "!e!x"),
+)
+"""Tags of YAML, with types that its readers know and with others."""
+
+DIRECTIVES = ("%YAML 1.1", "%YAML 1.2", "%YAML 9.9", "%TAG ! tag:x:", "%TAG !! tag:y:", "%X y")
+"""Lines that begin a document of YAML."""
+
+LINE_ENDS = (b"\r\n", b"\r", b"\n\r", b"\r\r\n", b"\x0b", b"\x0c", b"\xc2\x85", b"\xe2\x80\xa8")
+"""What other systems and programs write between two lines, and what Python takes for it."""
 
 
 def mutate_text(content: bytes, rng: Random) -> tuple[bytes, str]:
@@ -148,6 +162,45 @@ def _encode(content: bytes, rng: Random) -> bytes:
     )
 
 
+def _tag(content: bytes, rng: Random) -> bytes:
+    """Write a tag before a value, or a directive above a document."""
+    remark = b"# " if content.startswith(b"# ") else b""
+    if rng.random() < 0.2:
+        line = rng.choice(DIRECTIVES).encode() + rng.choice([b"\n", b"\n" + remark + b"---\n"])
+        return remark + line + content
+    matches = list(VALUE.finditer(content))
+    if not matches:
+        return content
+    at = rng.choice(matches).end()
+    value = rng.choice([b"", b'""', b"p ", b"_ ", b"x\n"])
+    return content[:at] + rng.choice(TAGS).encode() + b" " + value + content[at:]
+
+
+VALUE = re.compile(rb"(?:: |- |\[|, )(?=\S)")
+"""What stands before a value of YAML."""
+
+
+def _change_line_ends(content: bytes, rng: Random) -> bytes:
+    """Write other line ends: all of them, or some."""
+    end, share = rng.choice(LINE_ENDS), rng.choice([1.0, 1.0, 0.5, 0.1])
+    lines = content.split(b"\n")
+    return (
+        b"".join(line + (end if rng.random() < share else b"\n") for line in lines[:-1]) + lines[-1]
+    )
+
+
+def _write_windows_path(content: bytes, rng: Random) -> bytes:
+    """Replace a name of a file or a word by a path of Windows."""
+    matches = list(FILE.finditer(content)) or list(WORD.finditer(content))
+    if not matches:
+        return content
+    match = rng.choice(matches)
+    return content[: match.start()] + rng.choice(WINDOWS_PATHS).encode() + content[match.end() :]
+
+
+FILE = re.compile(rb"[\w./-]+\.(?:csv|yaml|json|txt|npz)\b")
+
+
 def _append(content: bytes, rng: Random) -> bytes:
     return content.rstrip(b"\n") * (rng.random() < 0.95) + rng.choice(TAILS)
 
@@ -167,4 +220,7 @@ MUTATIONS: dict[str, Callable[[bytes, Random], bytes]] = {
     "encoding": _encode,
     "append": _append,
     "twice": _repeat,
+    "tag": _tag,
+    "line-ends": _change_line_ends,
+    "windows-path": _write_windows_path,
 }

@@ -33,6 +33,13 @@ NAMES = (
 )  # fmt: skip
 """Text in place of a name: signs of YAML, CSV, HTML and terminals, and words with a meaning."""
 
+WINDOWS_PATHS = (
+    "C:\\data\\x.csv", "C:data.csv", "C:/data.csv", "\\\\server\\share\\x.csv", "..\\x.csv",
+    ".\\data.csv", "sub\\data.csv", "\\data.csv", "NUL", "con.csv", "COM1.yaml", "aux", "data.csv.",
+    "data.csv ", "data.csv:stream", "\\\\?\\C:\\x.csv", "DATA.CSV", "Robot.yaml",
+)  # fmt: skip
+"""Paths as Windows writes them, and names that it does not allow."""
+
 LONE_SURROGATE = "\ud800"
 """Half of a character: JSON and YAML can write it (as an escape), UTF-8 cannot."""
 

@@ -14,6 +14,7 @@ from itertools import pairwise
 from pathlib import Path
 from xml.parsers import expat
 
+from loopcal.plain_text import escape
 from tools.fuzz.cases import Case
 from tools.fuzz.execution import CPU_LIMIT, Outcome
 
@@ -26,6 +27,8 @@ FRAME = re.compile(r'File "[^"]*?/src/(loopcal/[^"]+)", line (\d+), in (\S+)')
 MESSAGE = re.compile(r"^(loopcal: |Hint: |  )")
 ARCHIVES_AND_PICTURES = (b"\x89PNG", b"%PDF", b"PK", b"SQLite format 3")
 """First bytes of files that are no text."""
+SECONDS = re.compile(r"in [\d.e-]+ s\b|\"seconds\": [\d.e-]+")
+"""How long a study took, which differs from run to run."""
 LOGS = (".sqlite-shm", ".sqlite-wal")
 """Files that SQLite makes beside a store, also to read it."""
 
@@ -66,6 +69,34 @@ def _list_finds(case: Case, outcome: Outcome, folder: Path) -> list[Find]:
     return finds
 
 
+def judge_surroundings(case: Case, outcome: Outcome, plain: Outcome) -> list[Find]:
+    """Return whether files and variables of other programs changed the answer to an input.
+
+    plain : the outcome without them.
+    """
+    if any(word in kind for kind, _ in outcome.failures + plain.failures for word in ["TimeIsUp"]):
+        return []
+    mine = {name: c for name, c in outcome.after.items() if name not in case.foreign}
+    folders = {part for name in case.foreign for part in map(str, Path(name).parents)}
+    parts = (
+        ("exit code", outcome.code, plain.code),
+        ("stdout", SECONDS.sub("", outcome.out), SECONDS.sub("", plain.out)),
+        ("stderr", outcome.err, plain.err),
+        *(
+            (f"file {Path(name).suffix}", mine.get(name), plain.after.get(name))
+            for name in sorted({*mine, *plain.after} - folders)
+            if not name.endswith((*LOGS, ".sqlite"))  # a store states seconds
+        ),
+    )
+    changed = [
+        (what, f"{one!r:.400} instead of {two!r:.400}") for what, one, two in parts if one != two
+    ]
+    by = sorted(k.partition(": ")[2] for k in case.damage if k.startswith("surroundings"))
+    return [
+        Find("surroundings", f"{case.words[:1]} {what}", f"{by}: {how}") for what, how in changed
+    ]
+
+
 def find_place(text: str) -> str:
     """Return the innermost function of loopcal in a traceback."""
     frames = FRAME.findall(text)
@@ -89,6 +120,8 @@ def _judge_message(case: Case, outcome: Outcome) -> Iterator[Find]:
         if match := CONTROL.search(text):
             near = text[max(match.start() - 60, 0) : match.end() + 20]
             yield Find("control-character", f"{command} {name}: {normalize(near)}", repr(near))
+    if outcome.code == 1 and lines and not is_usage and not _names_something(case, outcome.err):
+        yield Find("no-name", f"{command}: {normalize(outcome.err)}", outcome.err[-600:])
     if "not enough memory" in outcome.err:
         yield Find("memory", command, outcome.err[-300:])
     if not is_usage and re.search(r"defect of loopcal|Traceback", outcome.err):
@@ -98,6 +131,16 @@ def _judge_message(case: Case, outcome: Outcome) -> Iterator[Find]:
         yield Find("no-number", f"{command}: {match[0]}", (outcome.err + outcome.out)[-600:])
     if re.search(r"object at 0x|<class '|NoneType|dtype\(|array\(\[", outcome.err):
         yield Find("internal-words", f"{command}: {normalize(outcome.err)}", outcome.err[-600:])
+
+
+def _names_something(case: Case, message: str) -> bool:
+    """Return whether a message names a file, an option, an argument or a word of the input."""
+    said = "".join(line for line in message.splitlines() if not line.startswith("Hint: see "))
+    if re.search(r"(?<![\w-])--?[a-z]|Missing argument '", said):
+        return True
+    names = {part for name in case.files for part in (name, Path(name).name)}
+    words = {word.lstrip("-") or "." for word in case.words[1:]}  # "" is the folder
+    return any(escape(name) in said for name in (names | words))
 
 
 def normalize(text: str) -> str:
@@ -140,7 +183,8 @@ def _judge_success(case: Case, outcome: Outcome, folder: Path) -> Iterator[Find]
             yield from _judge_output(case, name, content, may_name)
     if outcome.code == 0 and "--help" not in case.words and "-h" not in case.words:
         for name in _outputs(case)[:1]:
-            if not (folder / name).exists():
+            is_list = case.words[:1] == ["example"] and len(case.words) == 3  # no name is given
+            if not is_list and not (folder / name).exists():
                 yield Find("missing-output", command, name)
     yield from judge_readable(case, outcome, folder)
 

@@ -17,7 +17,7 @@ from loopcal.apply.validation import (
 )
 from loopcal.diagnose.row_errors import PoseErrors, Statistics, join_errors
 from loopcal.diagnose.value_comparison import EQUAL, refuse_other_dimensions
-from loopcal.errors import DataError
+from loopcal.errors import DataError, FileError
 from loopcal.estimate.posterior import Posterior
 from loopcal.estimate.recalibration import (
     CHANGE_LEVEL,
@@ -378,9 +378,16 @@ def _find_common_poses(runs: Sequence[Run]) -> tuple[str, ...]:
 
 
 def _read_errors(run: Run, poses: Sequence[str] | None = None) -> PoseErrors:
-    """Return the stored errors at held-out poses: at all, or in rows that measure only `poses`."""
+    """Return the stored errors at held-out poses: at all, or in rows that measure only `poses`.
+
+    FileError : the run states something else than errors.
+    """
     stored = run.result.get("validation")
-    validation = stored and restore_validation(stored, run.arrays, run.robot)
+    try:
+        validation = stored and restore_validation(stored, run.arrays, run.robot)
+    except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
+        problem = "'validation' is not what a calibration writes"
+        raise FileError(report_finding("files.run-damaged", problem=problem), run.path) from error
     if not validation:
         return PoseErrors()
     labels = validation.poses

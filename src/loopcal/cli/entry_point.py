@@ -12,6 +12,7 @@ from __future__ import annotations
 import _thread
 import keyword
 import os
+import re
 import shlex
 import signal
 import sys
@@ -28,7 +29,7 @@ import loopcal
 from loopcal.cli import terminal
 from loopcal.cli.hints import find_hint, word_hint
 from loopcal.environment import pin_settings
-from loopcal.errors import LoopcalError, suggest_names
+from loopcal.errors import FileError, LoopcalError, suggest_names
 from loopcal.findings import Finding
 from loopcal.output_record import record_outputs
 
@@ -236,6 +237,8 @@ def _report(
             finding = error.args[0] if error.args else None
             sentence, hint = str(error), find_hint(error.code, command)
             hint = word_hint(finding, hint) if isinstance(finding, Finding) else hint
+            if not isinstance(error, FileError):  # which names its file
+                sentence = _name_inputs(sentence, hint, command, words)
         case KeyboardInterrupt() | click.exceptions.Abort():
             sentence = f"stopped before the end{unwritten}."
         case OSError():
@@ -251,6 +254,26 @@ def _report(
             _refuse(describe_defect(error, words), words)
             return 3
     return _refuse(sentence, words, hint, getattr(error, "code", None))
+
+
+def _name_inputs(
+    sentence: str, hint: str | None, command: click.Command | None, words: Sequence[str]
+) -> str:
+    """Return a sentence with the inputs of the command in front, where it names neither one of them
+    nor an option; a word such as `run` is a name in quotes or before a colon.
+    """
+    is_named = re.search(r"(?<!\S)'?--?[a-z]", f"{sentence} {hint or ''}") is not None
+    if command is None or is_named:
+        return sentence
+    rest = words[1 + (command.name != words[0]) :]
+    given = command.make_context(None, list(rest), resilient_parsing=True).params
+    values = (given[p.name or ""] for p in command.params if isinstance(p, click.Argument))
+    names = [str(v) for of in values for v in (of if isinstance(of, tuple) else (of,)) if v]
+    for name in names:
+        is_word = name.isalpha()
+        if any(form in sentence for form in ((f"{name}:", repr(name)) if is_word else (name,))):
+            return sentence
+    return f"{' and '.join(names[:3])}: {sentence}" if names else sentence
 
 
 def _refuse(

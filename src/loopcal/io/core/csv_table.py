@@ -299,7 +299,8 @@ def require_columns(table: Table, needed: Sequence[str], why: str) -> None:
         if name not in table.units:
             hints = (suggest_header(other, symbol, [name]) for other, symbol in table.units.items())
             hint = next(filter(None, hints), suggest_names(name, spare))
-            raise table.header_error(f"no column {name!r}{hint}, {why}. Add it with its unit")
+            unit = "" if name in NAME_COLUMNS else " with its unit"
+            raise table.header_error(f"no column {name!r}{hint}, {why}. Add it{unit}")
 
 
 def suggest_header(header: str, symbol: str | None, known: Iterable[str]) -> str:

@@ -15,7 +15,7 @@ from pathlib import Path
 from loopcal.errors import FileError
 from loopcal.findings import Finding, report_finding
 from loopcal.frozen_dataclass import dataclass, replace
-from loopcal.io.core.csv_table import Table, format_header, format_row, read_table
+from loopcal.io.core.csv_table import Table, format_header, format_row, read_table, require_columns
 from loopcal.io.core.text_file import read_text
 from loopcal.io.data.kind_settings import KindRows, read_kinds
 from loopcal.io.data.measurement_file import join_tables, read_tables
@@ -119,6 +119,7 @@ def fill_sheet(
 def _read_sheet(path: Path, robot: Mechanism) -> tuple[Table, KindRows]:
     """Return the sheet and its only kind; FileError where it has measured values or other rows."""
     table = read_table(path)
+    require_columns(table, ("pose",), "which the points of an export are joined with")
     kinds = read_kinds(table, robot)
     if len(kinds) != 1 or kinds[0].kind.poses_per_row != 1 or "kinds" in table.settings.content:
         raise FileError(report_finding("sheet.kinds", count=len(kinds)), path)

@@ -16,7 +16,7 @@ from msgspec import convert
 
 from loopcal.apply.simulated_measurements import InstrumentDescription, build_instrument
 from loopcal.diagnose.error_frames import BASE, choose_error_frame, list_unfixed_motions
-from loopcal.errors import DataError, UnitError, suggest_names
+from loopcal.errors import DataError, FileError, UnitError, suggest_names
 from loopcal.estimate.identification import compute_trial_posterior, identify_trials
 from loopcal.estimate.options import FitOptions
 from loopcal.estimate.penalties import MAP, LeastSquares
@@ -64,8 +64,12 @@ KEPT_ROBOTS = 8
 
 @lru_cache(maxsize=KEPT_ROBOTS)
 def build_robot_of(text: str) -> Mechanism:
-    """Return the robot of the text of a robot file."""
-    return build_robot(parse_yaml(text, Path("robot of the study"), "robot file"))
+    """Return the robot of the text of a robot file; DataError where it is none."""
+    try:
+        return build_robot(parse_yaml(text, Path("robot"), "robot file"))
+    except FileError as error:
+        where = f"line {error.line or 1} of a robot of the study"
+        raise DataError(f"{where}: {error.sentence}") from error
 
 
 def change_tolerances(robot: Mechanism, errors: ErrorsLevel) -> Mechanism:
