@@ -514,9 +514,12 @@ def add_setup_uncertainty(result: Identification, fit: Descent) -> Identificatio
     Residuals below the stated noise scale the covariance of all rows, by s^2, and so that of these
     statements, of which they show nothing: 1 - s^2 of their part is added.
     """
-    setup, test = result.nuisance, result.residual_test
+    test = result.residual_test
+    if not (result.converged and test.intervals and test.sigma_scale < 1.0):
+        return result
+    setup = result.nuisance
     stated = setup.table.free & ~np.isnan(setup.table.tolerance)
-    if not (result.converged and test.intervals and stated.any() and test.sigma_scale < 1.0):
+    if not stated.any():
         return result
     V, information = fit.decomposition.directions[0], fit.decomposition.singular_values[0] ** 2
     rows = (setup.slope[stated] / setup.table.tolerance[stated, None]) @ V

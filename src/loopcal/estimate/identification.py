@@ -19,89 +19,31 @@ import numpy as np
 from loopcal.errors import DataError, EstimationError, suggest_names
 from loopcal.estimate.descent import Descent, LinearModel, descend
 from loopcal.estimate.determinable_setup import fix_undetermined_setup
-from loopcal.estimate.fit_descent import (
-    add_loss_uncertainty,
-    add_setup_uncertainty,
-    fit_rows,
-    fit_with_tolerances,
-    get_method,
-    repeat_trials,
-    report_closure_start,
-)
+from loopcal.estimate.fit_analysis import ASSUMED, FitAnalysis
+from loopcal.estimate.fit_descent import fit_rows, fit_with_tolerances, get_method, repeat_trials
 from loopcal.estimate.free_parameters import FreeParameters, select_free_parameters
 from loopcal.estimate.information import has_equations_to_spare
-from loopcal.estimate.linearization import (
-    Linearization,
-    PoseEstimates,
-    PoseSolution,
-    Start,
-    linearize_rows,
-)
+from loopcal.estimate.linearization import PoseSolution, Start, linearize_rows
 from loopcal.estimate.losses import Loss
-from loopcal.estimate.null_space import describe_null_space
-from loopcal.estimate.observation_rows import Residuals, linked_blocks
 from loopcal.estimate.options import FitOptions, merge_options
-from loopcal.estimate.penalties import (
-    MAP,
-    LeastSquares,
-    Method,
-    adapt_method,
-    describe_regularization,
-    fix_penalty,
-)
-from loopcal.estimate.pose_estimate import (
-    estimate_poses,
-    find_unclosed_poses,
-    predict_from_readings,
-    report_doubtful_readings,
-    report_uneven_sigmas,
-)
-from loopcal.estimate.posterior import (
-    Posterior,
-    VarianceSources,
-    compute_posterior,
-    describe_information,
-    find_shown_noise,
-    find_variance_sources,
-)
+from loopcal.estimate.penalties import MAP, LeastSquares, Method, adapt_method, fix_penalty
+from loopcal.estimate.pose_estimate import find_unclosed_poses
+from loopcal.estimate.posterior import Posterior, VarianceSources, compute_posterior
 from loopcal.estimate.prior import refuse_reused_rows
-from loopcal.estimate.prior_inflation import add_factor_uncertainty, run_prior_tests
 from loopcal.estimate.problem import Problem, problem_of, problem_of_trials
-from loopcal.estimate.residual_test import FEWEST_DEGREES, ResidualTest, run_residual_test
-from loopcal.estimate.result import (
-    History,
-    Identification,
-    NuisanceEstimate,
-    Spectrum,
-    add_followers,
-    estimate_nuisance,
-    label_residuals,
-    report_divergence,
-    report_equations,
-    report_unknown_bias,
-    report_used_poses,
-)
-from loopcal.estimate.unfixed_motions import (
-    FrameRows,
-    UnfixedMotions,
-    describe_frames,
-    find_frame_knowledge,
-)
-from loopcal.findings import Finding, report_finding
+from loopcal.estimate.residual_test import FEWEST_DEGREES
+from loopcal.estimate.result import Identification
+from loopcal.estimate.unfixed_motions import find_frame_knowledge
+from loopcal.findings import report_finding
 from loopcal.frozen_dataclass import dataclass, replace
 from loopcal.measure.array_checks import check_type
 from loopcal.measure.data_checks import check_actuators, check_types
-from loopcal.measure.fitted_rows import FittedRows, collect_fitted_rows
-from loopcal.measure.kinds.kind import list_error_groups
 from loopcal.measure.measurements import Measurements
-from loopcal.measure.nuisance import NuisanceParameters
 from loopcal.measure.readings import fill_in_reading_sigma, weight_reading_sigma
 from loopcal.measure.simulation import Trials
-from loopcal.mechanism.compilation import find_impossible_values
 from loopcal.mechanism.model import Mechanism
 from loopcal.numerics.decomposition import Decomposition, solve_regular
 from loopcal.numerics.gauss_newton import DescentStatus
-from loopcal.parameters import ParameterTable
 from loopcal.results.description import Field, label_axes
 from loopcal.results.result import TableResult
 from loopcal.typing import BoolArray, FloatArray, IntArray, Progress, report_no_progress
@@ -221,40 +163,6 @@ def check_start(
     )
 
 
-def fit_setup_alone(
-    robot: Mechanism, data: Measurements, nuisance: NuisanceParameters
-) -> FloatArray:
-    """Return nuisance parameters (U,) [SI] that fit measurements best at the robot's geometry.
-
-    Poses that the geometry does not reach do not count. NaN where the others do not determine the
-    parameters, and no value is stated.
-    """
-    table = nuisance.table
-    unknown = np.where(table.free & np.isnan(table.tolerance), np.nan, nuisance.values())
-    solution, known = predict_from_readings(robot, data)
-    reached = solution.converged & known
-    if not reached.any():
-        return unknown
-    reached_data = data.take(reached)
-    reached_setup = reached_data.nuisance_parameters
-    entries = {entry.name: entry for entry in table.entries}
-    stated = ParameterTable(tuple(entries[name] for name in reached_setup.table.names))
-    nothing = np.zeros(0)
-    fixed = FreeParameters(robot, nothing.astype(np.int64), nothing, nothing, nothing.astype(bool))
-    setup, z = replace(reached_setup, table=stated), nothing[None]
-    problem = problem_of(fixed, reached_data, setup)
-    try:
-        fitted = problem.solve(z, problem.start(z)).nuisance
-    except DataError:  # too few rows for a closed form
-        return unknown
-    values = {} if fitted is None else dict(zip(reached_setup.table.names, fitted[0], strict=True))
-    return np.array([values.get(name, unknown[i]) for i, name in enumerate(table.names)])
-
-
-ASSUMED = "assumed"
-"""Noise that nobody stated: a program that wrote the measurements assumed it."""
-
-
 def choose_noise(options: FitOptions, data: Measurements, left: int) -> FitOptions:
     """Return options that estimate the noise where all of it is assumed; `left` is the number of
     equations less that of all unknowns.
@@ -263,45 +171,6 @@ def choose_noise(options: FitOptions, data: Measurements, left: int) -> FitOptio
     if is_free and data.noise_source == ASSUMED and left >= FEWEST_DEGREES:
         return replace(options, noise="estimated")
     return options
-
-
-def report_noise(data: Measurements, robot: Mechanism, test: ResidualTest) -> Finding:
-    """Return the residuals against the noise, with assumed and estimated sigmas where some are."""
-    if data.noise_source == "stated" or not test.converged or test.weighted:
-        return test.finding
-    if test.noise == "estimated":
-        if not test.intervals:
-            return test.finding
-        sigmas = _list_sigmas(data, robot, test.sigma_scale)
-        return report_finding("noise.assumed-replaced", sigmas=sigmas, dof=test.dof)
-    if test.degrees < 0.5 or np.isnan(test.p_value):
-        return report_finding("noise.assumed-untested", sigmas=_list_sigmas(data, robot, 1.0))
-    ratio = float(np.sqrt(test.chi_square / test.degrees))
-    return report_finding(
-        "noise.assumed",
-        sigmas=_list_sigmas(data, robot, ratio),
-        ratio=ratio,
-        degrees=test.degrees,
-        p_value=test.p_value,
-    )
-
-
-def _list_sigmas(data: Measurements, robot: Mechanism, scale: float) -> list[dict[str, Any]]:
-    """Return kind, quantity, assumed and estimated sigma of each quantity with assumed noise."""
-    sigmas: dict[tuple[str, str], dict[str, Any]] = {}
-    for rows in (o for o in data.observations if o.is_noise_assumed and len(o)):
-        variance = np.diagonal(rows.covariance, axis1=1, axis2=2)
-        for group in list_error_groups(rows.kind):
-            sigma = float(np.sqrt(np.median(variance[:, list(group.columns)])))
-            values = (robot.to_quantity(value, group.dimension) for value in (sigma, scale * sigma))
-            assumed, estimated = values
-            sigmas[rows.kind.name, group.quantity] = {
-                "kind": rows.kind.name,
-                "quantity": group.quantity,
-                "assumed": assumed,
-                "estimated": estimated,
-            }
-    return list(sigmas.values())
 
 
 def identify(
@@ -361,142 +230,8 @@ def identify(
     unclosed = find_unclosed_poses(robot.with_values(values), data)
     if fit.status[0] != DescentStatus.CONVERGED.value and unclosed.are_most:
         raise EstimationError(unclosed.report("fit.poses-open"))
-    result = _assemble(robot, free, options, data, fit, weights, problem, weighted)
-    result = add_setup_uncertainty(add_factor_uncertainty(result, fit), fit)
-    if options.loss is not None:
-        result = add_loss_uncertainty(result, fit, problem, weighted, linked_blocks(data))
-    findings = list(result.findings)
-    rows: FittedRows | None = collect_fitted_rows(
-        data, are_readings_fitted=robot.program.sigma is not None
-    )
-    if (earlier := options.prior) is not None:
-        if earlier.fitted_rows is None:
-            findings.append(report_finding("prior.rows-unknown"))
-        rows = None if earlier.fitted_rows is None else earlier.fitted_rows.joined(rows)
-    if unclosed.poses:
-        findings.append(unclosed.report("fit.poses-open-at-start"))
-    d, test = fit.decomposition, result.residual_test
-    shown = find_shown_noise(d, test)
-    posterior = replace(
-        result.posterior,
-        fitted_rows=rows,
-        shown_noise=shown,
-        information=describe_information(free, d, test, shown),
-    )
-    return replace(result, posterior=posterior, findings=tuple(findings))
-
-
-def _examine_estimate(
-    problem: Problem, weighted: Problem, fit: Descent
-) -> tuple[
-    PoseEstimates | None, tuple[Residuals, ...], Linearization | None, UnfixedMotions | None
-]:
-    """Solve and evaluate the rows of a fit once more, where its last step ended.
-
-    Poses and residuals are those of the rows without weights of a loss, at the setup parameters of
-    the weighted ones; None: exact readings. The linearization is that of the weighted rows; None
-    without setup parameters. The last are the unfixed motions, see `FrameRows.find_unfixed`.
-    """
-    z, start = fit.deviation, fit.start
-    solution, linearization, nuisance = None, None, None
-    if weighted.nuisance is not None:
-        solution = weighted.solve(z, start, derivatives=True)
-        linearization, nuisance = weighted.linearize_at(z, start, solution), solution.nuisance
-    if solution is None or weighted is not problem:
-        solution = problem.solve(z, start, nuisance)
-    rows = FrameRows(weighted, nuisance)
-    residuals = problem.residuals(z, solution, rows.add)
-    return solution.estimates, residuals, linearization, rows.find_unfixed()
-
-
-def _assemble(
-    robot: Mechanism,
-    free: FreeParameters,
-    options: FitOptions,
-    data: Measurements,
-    fit: Descent,
-    weights: FloatArray,
-    problem: Problem,
-    weighted: Problem,
-) -> Identification:
-    """Return the result of a fit with all diagnostics."""
-    converged = bool(fit.status[0] == DescentStatus.CONVERGED.value)
-    d, penalty, method = fit.decomposition, fit.penalty, get_method(options)
-    is_assumed = options.noise == "given" and data.noise_source != "stated"
-    noise, is_weighted = ASSUMED if is_assumed else options.noise, options.loss is not None
-    test = run_residual_test(d, penalty, noise, options.sigma_uncertainty, is_weighted, converged)
-    sources = find_variance_sources(d, penalty, test, method, free)
-    test = replace(test, intervals=bool(np.isfinite(sources.noise)))
-    estimates, residuals, linearization, motions = _examine_estimate(problem, weighted, fit)
-    conflict, on_prior = run_prior_tests(free, fit, method)
-    plain, values = d.plain(), free.values(fit.deviation)[0]
-    corrected, setup = robot.with_values(values), weighted.nuisance
-    nuisance = NuisanceEstimate.empty(problem.parameters)
-    if setup is not None and linearization is not None:
-        # a fit begins with the setup that fits its first robot best, with all poses and no weights
-        began_there = options.start is None and not is_weighted
-        baseline = None
-        if not (began_there and np.isfinite(fit.cost_history[0, 0])):
-            baseline = fit_setup_alone(robot, data.with_weights(weights), setup.local)
-        variance = d.variances(penalty, *sources)[0]
-        nuisance = estimate_nuisance(
-            setup, linearization, robot, d, variance, sources.noise, baseline
-        )
-    frames = describe_frames(weighted, data, motions, options.prior, linearization, sources.noise)
-    null_space = plain.null_space()
-    unidentifiable = add_followers(describe_null_space(free, null_space), null_space, nuisance)
-    excluded = tuple(options.excluded_poses)
-    poses, on_poses = None, []
-    if estimates is not None:
-        poses = estimate_poses(estimates, data, excluded)
-        doubtful = report_doubtful_readings(corrected, poses)
-        on_poses = [*poses.report(), *doubtful, *report_uneven_sigmas(problem)]
-    history = History(
-        status=DescentStatus(int(fit.status[0])),
-        iterations=int(fit.iterations[0]),
-        cost=fit.cost_history[:, 0],
-        estimate=free.nominal + free.tolerance * fit.deviation_history[:, 0],
-    )
-    regularization = describe_regularization(method, d, penalty)
-    findings = [
-        *([] if converged else [history.finding]),
-        report_noise(data, robot, test),
-        *report_divergence(free, fit.deviation[0], method, converged),
-        *(finding for _, finding in find_impossible_values(robot, values)),
-        *on_prior,
-        *(combination.finding for combination in unidentifiable),
-        *nuisance.report_unobservable(),
-        *free.findings(),
-        *report_closure_start(problem, options, fit),
-        *([] if regularization is None else [regularization.finding]),
-        *report_unknown_bias(free, method, sources.prior),
-        *report_equations(int(problem.equations[0]), problem.parameters, method),
-        *report_used_poses(data, weights, options.loss, excluded),
-        *on_poses,
-    ]
-    return Identification(
-        robot=corrected,
-        initial=robot,
-        options=options,
-        free_parameters=free,
-        covariance=d.covariance(penalty, *sources)[0] * free.tolerance[:, None] * free.tolerance,
-        posterior=compute_posterior(
-            corrected, free.places, free.tolerance, d, penalty, sources, frames, test.noise_degrees
-        ),
-        spectrum=Spectrum(
-            int(plain.rank[0]), float(plain.condition[0]), plain.singular_values[0], d.tolerance
-        ),
-        regularization=regularization,
-        unidentifiable=unidentifiable,
-        residual_test=test,
-        prior_conflict=conflict,
-        residuals=label_residuals(residuals, data, problem),
-        pose_weights=weights,
-        history=history,
-        nuisance=nuisance,
-        poses=poses,
-        findings=tuple(findings),
-    )
+    analysis = FitAnalysis(robot, free, options, data, problem, weights, weighted, fit, unclosed)
+    return analysis.identification()
 
 
 @dataclass(frozen=True, eq=False)

@@ -46,6 +46,7 @@ from loopcal.mechanism.model import Mechanism
 from loopcal.numerics.decomposition import Decomposition, are_nonzero
 from loopcal.numerics.gauss_newton import DescentStatus
 from loopcal.parameters import ParameterTable
+from loopcal.results.deferred import DeferredFields, deferred
 from loopcal.results.description import OTHER, Field, Source, fields, label_axes
 from loopcal.results.presenters import draw
 from loopcal.results.result import TableResult
@@ -321,10 +322,11 @@ class History:
 
 
 @dataclass(frozen=True, eq=False)
-class Identification(TableResult):
+class Identification(DeferredFields, TableResult):
     """A robot identified from measurements.
 
-    Arrays over parameters are (p,) in the order of `names`, in SI units.
+    Arrays over parameters are (p,) in the order of `names`, in SI units. Fields but the first four
+    are computed when they are first asked for; their values do not depend on the order of asking.
 
     Attributes
     ----------
@@ -349,19 +351,19 @@ class Identification(TableResult):
     initial: Mechanism
     options: FitOptions
     free_parameters: FreeParameters
-    covariance: FloatArray
-    posterior: Posterior
-    spectrum: Spectrum
-    regularization: Regularization | None
-    unidentifiable: tuple[Combination, ...]
-    residual_test: ResidualTest
-    prior_conflict: PriorConflict | None
-    residuals: tuple[KindResiduals, ...]
-    pose_weights: FloatArray
-    history: History
-    nuisance: NuisanceEstimate
-    poses: EstimatedPoses | None
-    findings: tuple[Finding, ...]
+    covariance: FloatArray = deferred()
+    posterior: Posterior = deferred()
+    spectrum: Spectrum = deferred()
+    regularization: Regularization | None = deferred()
+    unidentifiable: tuple[Combination, ...] = deferred()
+    residual_test: ResidualTest = deferred()
+    prior_conflict: PriorConflict | None = deferred()
+    residuals: tuple[KindResiduals, ...] = deferred()
+    pose_weights: FloatArray = deferred()
+    history: History = deferred()
+    nuisance: NuisanceEstimate = deferred()
+    poses: EstimatedPoses | None = deferred()
+    findings: tuple[Finding, ...] = deferred()
 
     FIELDS: ClassVar[tuple[Field, ...]] = (
         *fields(robot="robot.name", method=lambda fit: repr(fit.method)),
