@@ -401,7 +401,8 @@ class Image(Kind):
             seen = (measured[:, None, :3, :3] @ q[..., None])[..., 0] + measured[:, None, :3, 3]
             moving = (T[:, None, :3, None, :3] * np.eye(4)[:, None, :, None]).reshape(-1, 3, 12)
             origin = np.repeat(T[:, :3, 3], 4, axis=0)
-            frames, places = solve_frame_and_points(seen.reshape(-1, 3), moving, origin)
+            sets = (seen.reshape(-1, 3)[None], moving[None], origin[None])
+            frames, places = solve_frame_and_points(*sets)[0]
             tools = [align_point_sets(q, of.reshape(4, 3)) for of in places]
             pairs += list(zip(frames, tools, strict=True))
         for frame, tool in ((None, stated[carried]), (stated[fixed], None)):
