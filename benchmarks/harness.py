@@ -97,11 +97,13 @@ def measure_time(
     reference_name: str,
     repeats: int,
     tolerance: float,
+    clock: Callable[[], float] | None = None,
 ) -> list[Metric]:
     """Time `subject` and `reference` in turns. The best absolute time has a limit, and the ratio of
-    the best times, `name` + `_of_` + `reference_name`, has a baseline.
+    the best times, `name` + `_of_` + `reference_name`, has a baseline. `clock` as in
+    `measure_ratio`.
     """
-    ours, theirs = map(min, time_in_turns(subject, reference, repeats=repeats))
+    ours, theirs = map(min, time_in_turns(subject, reference, repeats=repeats, clock=clock))
     factor = 1.0 if unit == "s" else 1e3
     note = f"best of {repeats}; {ours:.3g} s against {theirs:.3g} s"
     ratio = Metric(f"{name}_of_{reference_name}", ours / theirs, tolerance=tolerance, note=note)

@@ -380,16 +380,23 @@ class ScaledCandidates:
         return is_determined(self.factor(chosen))
 
 
-def compute_slopes(scoring: Scoring, R: FloatArray, scaled: FloatArray) -> FloatArray:
-    """Return the derivatives (N,) of the score by weights of groups (N, r, Q), at a nonsingular
-    factor R (Q, Q) of a design.
+def find_slope_columns(scoring: Scoring, R: FloatArray) -> FloatArray:
+    """Return B (Q, j) at a nonsingular factor R (Q, Q) of a design: |X B|^2 is the derivative of
+    the score by the weight of a group with scaled rows X.
     """
-    columns, scale = divide_by_factor(np.eye(len(R)), R)[:, scoring.n_nuisance :], 1.0
-    if scoring.prediction is not None:
-        P = scoring.predict(R)
-        columns, scale = columns @ P.T, float((P**2).sum())
-    Y = scaled.reshape(-1, len(R)) @ columns
-    return np.einsum("mq,mq->m", Y, Y).reshape(scaled.shape[:2]).sum(axis=1) / scale
+    columns = divide_by_factor(np.eye(len(R)), R)[:, scoring.n_nuisance :]
+    if scoring.prediction is None:
+        return columns
+    P = scoring.predict(R)
+    return columns @ P.T / np.linalg.norm(P)
+
+
+def compute_slopes(scaled: FloatArray, columns: FloatArray) -> FloatArray:
+    """Return the derivatives |X B|^2 (N,) of the score by weights of groups X (N, r, Q), with the
+    B (Q, j) of `find_slope_columns`.
+    """
+    Y = scaled.reshape(-1, len(columns)) @ columns
+    return np.einsum("mj,mj->m", Y, Y).reshape(scaled.shape[:2]).sum(axis=1)
 
 
 # The change of score by every swap at once.

@@ -53,6 +53,7 @@ from loopcal.planning.design_space import (
     compute_slopes,
     compute_swap_terms,
     divide_by_factor,
+    find_slope_columns,
     is_allowed,
     is_determined,
     score_additions,
@@ -168,8 +169,9 @@ def _slopes(scoring: Scoring, scaled: FloatArray, w: FloatArray) -> tuple[FloatA
     the score.
     """
     R = _factor(scoring, scaled, w)
-    d0 = compute_slopes(scoring, R, scoring.prior_rows[None])
-    return compute_slopes(scoring, R, scaled), float(d0[0]), scoring.score(R)
+    columns = find_slope_columns(scoring, R)
+    d0 = float(compute_slopes(scoring.prior_rows[None], columns)[0])
+    return compute_slopes(scaled, columns), d0, scoring.score(R)
 
 
 def _maximize_weights(
@@ -366,7 +368,7 @@ def _exchange_groups(
 
     def prepare(R: FloatArray) -> tuple[FloatArray, IntArray, SwapTerms]:
         """Return all slopes, the groups that may gain, and the terms of the chosen and of these."""
-        slopes = compute_slopes(scoring, R, rows)
+        slopes = compute_slopes(rows, find_slope_columns(scoring, R))
         may_gain = slopes > slopes[chosen].min()
         may_gain[chosen] &= candidates.repeats
         listed = np.flatnonzero(may_gain)
@@ -653,20 +655,27 @@ def _choose_levels(scoring: Scoring, rows: FloatArray, trials: FloatArray) -> In
     usable = is_allowed(trials.reshape(u * k, *rows.shape[1:])).reshape(u, k)
     present = scoring.scale_rows(rows)
     scaled = scoring.scale_rows(np.where(usable[:, :, None, None], trials, 0.0))
-    R = scoring.factor(present)
-    score = scoring.score(R)
+    R, least = scoring.factor(present), GAIN * scoring.height
+    score, columns = scoring.score(R), find_slope_columns(scoring, R)
     for i in np.flatnonzero(usable.any(axis=1)):
-        terms = compute_swap_terms(scoring, R, np.concatenate([present[i : i + 1], scaled[i]]))
-        gain = np.where(usable[i], score_swaps(terms, 0)[1:], -np.inf)
-        if gain.max() <= GAIN * scoring.height:
+        rows = np.concatenate([present[i : i + 1], scaled[i]])
+        slopes = compute_slopes(rows, columns)
+        # as for groups, a level gains at most the difference of the slopes
+        useful = np.flatnonzero(usable[i] & (slopes[1:] > slopes[0] + 0.5 * least))
+        if not len(useful):
             continue
-        level = int(np.argmax(gain))
+        terms = compute_swap_terms(scoring, R, rows[np.append(0, useful + 1)])
+        gain = score_swaps(terms, 0)[1:]
+        if gain.max() <= least:
+            continue
+        level = int(useful[np.argmax(gain)])
         old = present[i].copy()
         present[i] = scaled[i, level]
         new_R = scoring.factor(present)
         new_score = scoring.score(new_R)
         if new_score > score:
             R, score, best[i] = new_R, new_score, level
+            columns = find_slope_columns(scoring, R)
         else:
             present[i] = old
     return best
