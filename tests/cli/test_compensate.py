@@ -51,7 +51,7 @@ def test_written_readings_move_the_calibrated_robot_to_the_targets(loopcal, exam
     np.testing.assert_allclose(
         q, lc.inverse(lc.load_robot("run/robot.yaml"), WANTED).q, rtol=0, atol=1e-15
     )
-    assert table.text("note status") == ("reached in full",) * 2
+    assert set(table.text("note status")) == {"reached in full"}
     assert (table.numbers("note U x", lc.Dimension.LENGTH) < 3e-6).all()  # [m], instrument 1 um
 
 

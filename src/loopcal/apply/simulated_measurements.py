@@ -93,7 +93,7 @@ def simulate_measurements(
     data = simulate(truth, targets, instrument, seed, reading_sigma=reading_sigma, pose_names=names)
     if labels:
         data = replace(data, labels=tuple(labels))
-    check_strokes(data, truth, places=dict(enumerate(places)))
+    check_strokes(data, truth, places=places)
     return SimulatedMeasurements(data, truth, skipped)
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from loopcal.errors import DataError
-from loopcal.typing import BoolArray, FloatArray
+from loopcal.typing import BoolArray, FloatArray, IntArray
 
 
 def check_array(
@@ -48,7 +48,9 @@ def refuse_first(wrong: BoolArray, describe: Callable[..., str]) -> None:
 
 
 def broadcast_array(value: ArrayLike, shape: tuple[int, ...], what: str, wanted: str) -> FloatArray:
-    """Return a copy of an array, broadcast to a shape; DataError if it does not fit."""
+    """Return a read-only copy of an array, broadcast to a shape, in which equal entries that shared
+    their memory still do; DataError if it does not fit.
+    """
     try:
         if np.iscomplexobj(value):
             raise TypeError
@@ -56,9 +58,24 @@ def broadcast_array(value: ArrayLike, shape: tuple[int, ...], what: str, wanted:
     except (TypeError, ValueError):
         raise DataError(f"{what}: got {describe(value)}. Give {wanted}") from None
     try:
-        return np.array(np.broadcast_to(given, shape))
+        return np.broadcast_to(np.array(drop_repeats(given)), shape)
     except ValueError:
         raise DataError(f"{what} has shape {given.shape}. Give {wanted}") from None
+
+
+def drop_repeats(array: FloatArray) -> FloatArray:
+    """Return an array with length one along the axes along which broadcasting repeats it."""
+    return array[tuple(slice(None) if step else slice(1) for step in array.strides)]
+
+
+def take_rows(array: FloatArray, rows: IntArray | BoolArray) -> FloatArray:
+    """Return rows (k, ..), by index or mask, of an array (r, ..); of equal rows that share their
+    memory without a copy.
+    """
+    if not array.size or array.strides[0]:
+        return array[rows]
+    count = np.count_nonzero(rows) if rows.dtype == bool else len(rows)
+    return np.broadcast_to(array[0], (count, *array.shape[1:]))
 
 
 def check_pose(value: ArrayLike, what: str) -> FloatArray:

@@ -7,7 +7,7 @@ Each check raises a `DataError` made from a finding of the catalog, unless the c
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import fields
 from typing import Any, NamedTuple
 
@@ -103,12 +103,12 @@ def find_outside_strokes(readings: FloatArray, robot: Mechanism) -> FloatArray:
 
 
 def describe_outside_strokes(
-    measurements: Measurements, robot: Mechanism, places: Mapping[int, str] | None = None
+    measurements: Measurements, robot: Mechanism, places: Sequence[str] = ()
 ) -> dict[str, Any] | None:
     """Return the data of a finding on readings outside their strokes; None without any: the reading
     that is farthest outside, as a share of its stroke, and the number and the actuators of all.
 
-    places : of poses by index, such as `data.csv:12`.
+    places : of poses, such as `data.csv:12`.
     """
     commanded = [actuator.reference is None for actuator in robot.actuators]
     beyond = find_outside_strokes(measurements.readings, robot) * np.array(commanded)
@@ -124,7 +124,7 @@ def describe_outside_strokes(
     outside = np.flatnonzero(beyond.any(axis=0)).tolist()
     return {
         "pose": measurements.labels[pose],
-        "place": (places or {}).get(pose, ""),
+        "place": places[pose] if places else "",
         "actuator": actuator.name,
         "actuators": tuple(robot.actuators[j].name for j in outside),
         "reading": reading,
@@ -141,7 +141,7 @@ def check_strokes(
     robot: Mechanism,
     *,
     allow: bool = False,
-    places: Mapping[int, str] | None = None,
+    places: Sequence[str] = (),
 ) -> None:
     """Refuse readings outside the stroke of their actuator, unless they are allowed."""
     check_actuators(measurements, robot)

@@ -18,8 +18,10 @@ from loopcal.measure.array_checks import (
     broadcast_array,
     check_array,
     check_type,
+    drop_repeats,
     refuse_first,
     set_fields,
+    take_rows,
 )
 from loopcal.measure.kinds.kind import Evaluation, Kind, measure_progress
 from loopcal.numerics.statistics import find_distinct
@@ -80,7 +82,18 @@ def compute_whitener(covariance: FloatArray, present: BoolArray, weight: FloatAr
     covariance : (r, m, m) [SI], any numbers where a component is absent; DataError where it is not
         symmetric and positive definite. present : (r, m).
     weight : (r,) factor of the squared residuals, not negative; 0 excludes a row.
+
+    Rows of one covariance, present and weighted alike, share one matrix: W is then read-only.
     """
+    one = slice(1)
+    if (
+        len(present) > 1
+        and len(drop_repeats(covariance)) == 1
+        and np.all(present == present[one])
+        and np.all(weight == weight[one])
+    ):
+        shared = compute_whitener(covariance[one], present[one], weight[one])
+        return np.broadcast_to(shared, covariance.shape)
     both = present[:, :, None] & present[:, None, :]
     diagonal = np.eye(present.shape[1], dtype=bool)
     C = np.where(both, covariance, 0.0) + (diagonal & ~both)
@@ -332,7 +345,7 @@ class Observations:
         wrong = sd[~(is_sd(sd) | np.isnan(sd) | (sd == 0.0))]
         if len(wrong):
             raise DataError(f"sigma contains {wrong[0]:.6g}. Give numbers above 0, {SD_RANGE}")
-        N = kind.linearize_noise(values)
+        N, sd = drop_repeats(kind.linearize_noise(values)), drop_repeats(sd)
         covariance = (N * (sd * sd)[:, None, :]) @ np.swapaxes(N, -1, -2)
         of_session, of_group = np.asarray(session), np.asarray(group)
         return cls(kind, np.asarray(rows), values, covariance, session=of_session, group=of_group)
@@ -385,12 +398,13 @@ class Observations:
         """Return the rows at these indices, or of this mask."""
         chosen = np.asarray(keep)
         names = ("rows", "measured", "covariance", "weight", "session", "group")
-        arrays: dict[str, Any] = {name: getattr(self, name)[chosen] for name in names}
+        arrays: dict[str, Any] = {name: take_rows(getattr(self, name), chosen) for name in names}
         context = {name: values[chosen] for name, values in self.context.items()}
         if self.kind.is_drift.any():
             arrays["progress"] = self.drift_part[chosen]
         parts = tuple(
-            part._replace(covariance=part.covariance[chosen]) for part in self.noise_parts
+            part._replace(covariance=take_rows(part.covariance, chosen))
+            for part in self.noise_parts
         )
         return replace(self, context=context, noise_parts=parts, **arrays)
 
@@ -400,7 +414,7 @@ class Observations:
         together exceed the covariance belong to an earlier one, and do not count.
         """
         parts, variance = list(self.noise_parts), np.einsum("rii->ri", self.covariance)
-        rest = self.covariance - sum(part.covariance for part in parts)
+        rest = drop_repeats(self.covariance) - sum(drop_repeats(p.covariance) for p in parts)
         least = ROUNDING * np.where(self.present, variance, np.inf)
         if not parts or np.any(np.einsum("rii->ri", rest) < -least):  # or of another covariance
             dimensions = {column.dimension for column in self.kind.noise_columns}

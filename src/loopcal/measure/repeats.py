@@ -69,29 +69,32 @@ def find_repeats(readings: FloatArray, tolerance: FloatArray) -> IntArray:
     lie within the tolerance. Longer chains are divided at smaller gaps, in the end between all
     readings that differ.
     """
-    values = np.nan_to_num(readings, nan=MISSING)
+    values, sorting = np.nan_to_num(readings, nan=MISSING), np.zeros((0, 0), dtype=np.intp)
     label, is_open = np.zeros(len(values), dtype=np.intp), np.ones(len(values), dtype=bool)
     for gap in (*(tolerance / STEP**k for k in range(STEPS)), np.zeros_like(tolerance)):
-        label[is_open] = label.max() + 1 + _divide(values[is_open], gap, label[is_open])
+        if len(sorting) != np.count_nonzero(is_open):
+            sorting = np.argsort(values[is_open], axis=0, kind="stable")
+        label[is_open] = label.max() + 1 + _divide(values[is_open], gap, label[is_open], sorting)
         label = np.unique(label, return_inverse=True)[1].reshape(-1)
-        low, high = np.full((2, int(label.max()) + 1, values.shape[1]), [[[np.inf]], [[-np.inf]]])
-        np.minimum.at(low, label, values)
-        np.maximum.at(high, label, values)
-        is_open = np.any(high - low > tolerance, axis=1, keepdims=True)[label, 0]
+        order = np.argsort(label, kind="stable")
+        begin = np.flatnonzero(np.diff(label[order], prepend=-1))
+        ordered = values[order]
+        extent = np.maximum.reduceat(ordered, begin) - np.minimum.reduceat(ordered, begin)
+        is_open = np.any(extent > tolerance, axis=1)[label]
         if not is_open.any():
             break
     return label
 
 
-def _divide(values: FloatArray, gap: FloatArray, label: IntArray) -> IntArray:
+def _divide(values: FloatArray, gap: FloatArray, label: IntArray, sorting: IntArray) -> IntArray:
     """Return the numbers (n,) of groups that no column of values (n, a) can divide at a gap above
-    that of the column (a,), within those of a label (n,).
+    that of the column (a,), within those of a label (n,). `sorting` (n, a) orders each column.
     """
     count = 0
     while (groups := int(label.max()) + 1) > count:
         count = groups
-        for column, largest in zip(values.T, gap, strict=True):
-            order = np.lexsort((column, label))
+        for column, largest, by_column in zip(values.T, gap, sorting.T, strict=True):
+            order = by_column[np.argsort(label[by_column], kind="stable")]
             is_new = (np.diff(label[order]) != 0) | (np.diff(column[order]) > largest)
             label = np.empty_like(label)
             label[order] = np.concatenate([[0], np.cumsum(is_new)])
@@ -125,7 +128,8 @@ def find_copies(member: IntArray, values: FloatArray, sd: FloatArray, degrees: i
     for level in LEVELS:
         if not len(rows):
             break
-        label = _divide(filled[rows], np.full(len(sd), level), member[rows])
+        sorting = np.argsort(filled[rows], axis=0, kind="stable")
+        label = _divide(filled[rows], np.full(len(sd), level), member[rows], sorting)
         _, first, group = np.unique(label, return_index=True, return_inverse=True)
         original, agreeing = rows[first[group.reshape(-1)]], len(rows) - len(first)
         single = OVERSTATED * (2.0 * np.floor(level / step) + 1.0) * step / (2.0 * np.sqrt(np.pi))

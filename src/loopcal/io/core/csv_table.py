@@ -13,10 +13,14 @@ from __future__ import annotations
 import csv
 import math
 import re
+from array import array
+from bisect import bisect_right
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from decimal import Decimal, InvalidOperation
+from itertools import accumulate, chain, takewhile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -36,7 +40,7 @@ from loopcal.io.core.limits import (
 from loopcal.io.core.text_file import as_path, read_text
 from loopcal.io.core.yaml_file import YamlFile, parse_yaml, read_yaml
 from loopcal.plain_text import quote
-from loopcal.typing import FloatArray
+from loopcal.typing import FloatArray, IntArray
 from loopcal.units import LARGEST, Dimension, find_unit, parse_number
 
 
@@ -114,8 +118,8 @@ CONVERT_HINT = ", or convert an instrument's export by means of a profile (docs/
 SIDECAR_KEYS = ("kind", "kinds", "noise", "controller", "instrument", "reading_noise", "poses")
 """Keys by which a settings file is recognized among YAML files of the same name."""
 
-CHUNK = 256
-"""Rows that are split at once: so few that the collection of garbage hardly sees them."""
+BLOCK = 100_000
+"""Characters of rows that are split and parsed at once."""
 
 NAME_COLUMNS = ("pose", "use", "block", "kind", "session", "group")
 """Columns whose cells are names."""
@@ -125,21 +129,50 @@ _HEADER = re.compile(r"^(?P<name>[^\[\]]*[^\[\]\s])\s*(\[(?P<unit>[^\[\]]*)\])?$
 _ROUND_BRACKETS = re.compile(r"^(?P<name>[^()]*[^()\s])\s*\((?P<unit>[^()]*)\)$")
 
 
+class Cells(Sequence[str]):
+    """The cells of a column, kept as texts of some hundred cells with line feeds between them: as
+    objects of their own, the cells of a million rows would take five times the memory.
+    """
+
+    def __init__(self, blocks: Iterable[str]) -> None:
+        self._texts = tuple(blocks)
+        self._begins = list(accumulate((text.count("\n") + 1 for text in self._texts), initial=0))
+
+    @property
+    def blocks(self) -> Iterator[list[str]]:
+        """The cells, some hundred at a time."""
+        return (text.split("\n") for text in self._texts)
+
+    def __len__(self) -> int:
+        return self._begins[-1]
+
+    def __iter__(self) -> Iterator[str]:
+        return chain.from_iterable(self.blocks)
+
+    def __getitem__(self, place: Any) -> Any:
+        if isinstance(place, slice):
+            return tuple(self)[place]
+        if not 0 <= place < len(self):
+            raise IndexError(f"there is no row {place}")
+        number = bisect_right(self._begins, place) - 1
+        return self._texts[number].split("\n")[place - self._begins[number]]
+
+
 @dataclass(frozen=True)
 class Table:
     """Cells of a CSV file as text, with their lines.
 
     `units` : column -> unit symbol as written, None where there is none. `columns` : column ->
-    cells without surrounding blanks (a million rows as objects of their own would take time and
-    memory). `lines` : line of each row. `settings` are empty where the file has none.
+    cells without surrounding blanks. `lines` : line of each row. `settings` are empty where the
+    file has none.
     """
 
     path: Path
     settings: YamlFile
     header_line: int
     units: dict[str, str | None]
-    columns: Mapping[str, tuple[str, ...]]
-    lines: tuple[int, ...]
+    columns: Mapping[str, Cells]
+    lines: Sequence[int]
 
     def __len__(self) -> int:
         return len(self.lines)
@@ -149,11 +182,9 @@ class Table:
         """Column names in order."""
         return tuple(self.units)
 
-    def text(self, name: str, default: str = "") -> tuple[str, ...]:
-        """Return the cells of a column; `default` in every row where the column does not exist."""
-        if name not in self.units:
-            return (default,) * len(self)
-        return self.columns[name]
+    def text(self, name: str) -> Sequence[str]:
+        """Return the cells of a column; empty ones where it does not exist."""
+        return self.columns[name] if name in self.units else ("",) * len(self)
 
     @property
     def rows(self) -> Iterator[tuple[str, ...]]:
@@ -163,7 +194,7 @@ class Table:
     def pose_names(self) -> tuple[str, ...]:
         """Return the cells of the column `pose`; "1", "2", ... where it does not exist."""
         if "pose" in self.units:
-            return self.text("pose")
+            return tuple(self.text("pose"))
         return tuple(str(i + 1) for i in range(len(self)))
 
     def numbers(
@@ -188,14 +219,17 @@ class Table:
         self, name: str, factor: float, empty: bool = True, infinite: bool = False
     ) -> FloatArray:
         """Return the products (n,) of the cells of a column with a factor; see `numbers`."""
-        cells = self.text(name)
-        values = parse_decimals(cells, factor)
-        for row in np.flatnonzero(np.isnan(values)).tolist():
-            if infinite and cells[row] == "inf":
-                values[row] = math.inf
-            elif cells[row] or not empty:
-                raise self._refuse_cell(name, row, cells[row])
-        return values
+        parts, first = [np.zeros(0)], 0
+        for cells in self.columns[name].blocks:
+            values = parse_decimals(cells, factor)
+            for i in np.flatnonzero(np.isnan(values)).tolist():
+                if infinite and cells[i] == "inf":
+                    values[i] = math.inf
+                elif cells[i] or not empty:
+                    raise self._refuse_cell(name, first + i, cells[i])
+            parts.append(values)
+            first += len(cells)
+        return np.concatenate(parts)
 
     def factor(self, name: str, dimension: Dimension, symbol: str | None = None) -> float:
         """Return SI per unit of a column, or of `symbol`, a factor of its unit; see `numbers`."""
@@ -227,13 +261,28 @@ class Table:
         """Return an error at the line of a row."""
         return FileError(sentence, self.path, self.lines[row])
 
-    def places(self, rows: Iterable[int]) -> tuple[str, ...]:
+    def places(self, rows: IntArray) -> Places:
         """Return file and line of rows; see `place`."""
-        return tuple(map(self.place, rows))
+        return Places((self,), np.zeros(len(rows), dtype=np.intp), rows)
 
     def place(self, row: int) -> str:
         """Return file and line of a row, such as `data.csv:12`."""
         return f"{self.path}:{self.lines[row]}"
+
+
+class Places(Sequence[str]):
+    """Files and lines of rows, which are worded where one is asked for."""
+
+    def __init__(self, tables: Sequence[Table], number: IntArray, rows: IntArray) -> None:
+        """`number` (n,) of the table that has each of the `rows` (n,); -1 without any."""
+        self._tables, self.number, self.rows = tables, number, rows
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def __getitem__(self, i: Any) -> Any:
+        number = int(self.number[i])
+        return "" if number < 0 else self._tables[number].place(int(self.rows[i]))
 
 
 def read_table(path: str | Path) -> Table:
@@ -250,45 +299,43 @@ def read_table(path: str | Path) -> Table:
 def read_template(path: str | Path) -> Table:
     """Read a CSV table that may have no rows; raise as `read_table`."""
     path = as_path(path, WHAT)
-    lines = _read_lines(path)
-    settings, first = _read_settings(path, lines)
-    numbers = [
-        number
-        for number, line in enumerate(lines[first:], first + 1)
-        if line.strip() and not line.startswith("#")
-    ]
-    texts = [lines[number - 1] for number in numbers]
-    TABLE_ROWS.check(len(texts) - 1, WHAT, path)
-    if lengths := list(map(len, texts)):
-        longest = max(lengths)
-        LINE_LENGTH.check(longest, WHAT, path, numbers[lengths.index(longest)])
-        TABLE_COLUMNS.check(texts[0].count(",") + 1, WHAT, path, numbers[0])
+    text = read_text(path, WHAT, CONVERT_HINT, TABLE_SIZE)
+    TABLE_LINES.check(text.count("\n"), WHAT, path)
+    settings, first = _read_settings(path, text)
+    numbers, longest, header = array("q"), (0, 0), ""
+    for at, lines in _iterate_rows(text, first):
+        header = header or lines[0]
+        numbers.extend(at)
+        length = max(map(len, lines))
+        if length > longest[0]:
+            longest = (length, at[list(map(len, lines)).index(length)])
     if not numbers:
         raise FileError("this file has no header; its first line names columns and units", path)
-    header_line, header = numbers[0], texts[0]
+    header_line = numbers.pop(0)
+    TABLE_ROWS.check(len(numbers), WHAT, path)
+    LINE_LENGTH.check(longest[0], WHAT, path, longest[1])
+    TABLE_COLUMNS.check(header.count(",") + 1, WHAT, path, header_line)
     if "," not in header and (";" in header or "\t" in header):
         separator = "semicolons" if ";" in header else "tabs"
         sentence = f"columns are separated by {separator}. Use commas, and decimal points"
         raise FileError(sentence + CONVERT_HINT, path, header_line)
     units = _parse_header(path, header_line, header)
-    cells: list[list[str]] = [[] for _ in units]
-    for begin in range(1, len(texts), CHUNK):
-        part = slice(begin, begin + CHUNK)
-        rows = [_split_cells(path, *line) for line in zip(numbers[part], texts[part], strict=True)]
-        for number, row in zip(numbers[part], rows, strict=True):
+    blocks = []
+    for at, lines in _iterate_rows(text, header_line):
+        rows = [_split_cells(path, *line) for line in zip(at, lines, strict=True)]
+        for number, row in zip(at, rows, strict=True):
             if len(row) != len(units):
                 sentence = f"this row has {len(row)} cells, but the header has {len(units)} columns"
                 act = "Write one cell for each column, empty if not measured, with decimal points"
                 raise FileError(f"{sentence}. {act}", path, number)
-        for column, of_chunk in zip(cells, zip(*rows, strict=True), strict=True):
-            column.extend(of_chunk)
-    columns = dict(zip(units, map(tuple, cells), strict=True))
-    table = Table(path, settings, header_line, units, columns, tuple(numbers[1:]))
+        blocks.append(["\n".join(column) for column in zip(*rows, strict=True)])
+    columns = {name: Cells(block[i] for block in blocks) for i, name in enumerate(units)}
+    table = Table(path, settings, header_line, units, columns, numbers)
     for column in (name for name in NAME_COLUMNS if name in units):
         longest = LONGEST_COMPOSED if column == "pose" else LONGEST_NAME
         for cell in dict.fromkeys(table.text(column)):
             if (fault := find_fault(cell, longest)) is not None:
-                raise table.row_error(table.text(column).index(cell), fault)
+                raise table.row_error(tuple(table.text(column)).index(cell), fault)
     return table
 
 
@@ -332,25 +379,45 @@ def format_columns(columns: Mapping[str, Iterable[str]]) -> str:
     return "".join(format_row(cells) + "\n" for cells in (columns, *rows))
 
 
-def _read_lines(path: str | Path) -> list[str]:
-    text = read_text(path, WHAT, CONVERT_HINT, TABLE_SIZE)
-    TABLE_LINES.check(text.count("\n"), WHAT, path)
-    lines = text.split("\n")
-    return [line.rstrip("\r") for line in lines] if "\r" in text else lines
+def _iterate_lines(text: str) -> Iterator[tuple[int, list[str]]]:
+    """Yield the number of lines above some lines of a text, about `BLOCK` characters, and these."""
+    begin, count, has_returns = 0, 0, "\r" in text
+    while begin <= len(text):
+        end = text.find("\n", begin + BLOCK)
+        end = len(text) if end < 0 else end
+        lines = text[begin:end].split("\n")
+        yield count, [line.rstrip("\r") for line in lines] if has_returns else lines
+        begin, count = end + 1, count + len(lines)
 
 
-def _read_settings(path: Path, lines: Sequence[str]) -> tuple[YamlFile, int]:
-    """Return the settings, and the index of the first line below the front matter."""
-    count = next((i for i, line in enumerate(lines) if not line.startswith("#")), len(lines))
-    sidecar = _read_sidecar(path, any(_SETTING.match(line) for line in lines[:count]))
+def _iterate_rows(text: str, first: int) -> Iterator[tuple[list[int], list[str]]]:
+    """Yield numbers and texts of some lines at a time: those below the first ones that are neither
+    blank nor remarks.
+    """
+    for count, lines in _iterate_lines(text):
+        begin = max(first - count, 0)
+        rows = [
+            (number, line)
+            for number, line in enumerate(lines[begin:], count + begin + 1)
+            if line and line[0] != "#" and not line.isspace()
+        ]
+        if rows:
+            yield [number for number, _ in rows], [line for _, line in rows]
+
+
+def _read_settings(path: Path, text: str) -> tuple[YamlFile, int]:
+    """Return the settings, and the number of lines of the front matter."""
+    every = (line for _, lines in _iterate_lines(text) for line in lines)
+    lines = list(takewhile(lambda line: line.startswith("#"), every))
+    sidecar = _read_sidecar(path, any(map(_SETTING.match, lines)))
     if sidecar is not None:
         return sidecar, 0
-    text = "\n".join(line[1:] for line in lines[:count])
+    text = "\n".join(line[1:] for line in lines)
     if not any(line.strip() and not line.strip().startswith("#") for line in text.splitlines()):
-        return YamlFile(path, "", {}, {}), count
+        return YamlFile(path, "", {}, {}), len(lines)
     try:
         # `# key: value` leaves one blank before each key, the same for all
-        return parse_yaml(text, path, "front matter"), count
+        return parse_yaml(text, path, "front matter"), len(lines)
     except FileError as error:
         if error.code is not None:
             raise

@@ -246,6 +246,8 @@ class PoseColumn(TextColumn):
 
 def _number_blocks(cells: Sequence[str]) -> IntArray:
     """Return the numbers of named blocks; a pose without one is a block of its own."""
+    if not any(cells):
+        return np.arange(len(cells))
     keys = [("block", cell) if cell else ("pose", str(i)) for i, cell in enumerate(cells)]
     numbers = {key: i for i, key in enumerate(dict.fromkeys(keys))}
     return np.array([numbers[key] for key in keys])

@@ -45,7 +45,7 @@ from loopcal import geometry
 from loopcal.errors import DataError, suggest_names
 from loopcal.findings import report_finding
 from loopcal.frozen_dataclass import dataclass, replace
-from loopcal.io.core.csv_table import Table, format_scaled, require_columns
+from loopcal.io.core.csv_table import Places, Table, format_scaled, require_columns
 from loopcal.io.core.records import get_field_types, read_record
 from loopcal.io.core.text_file import name_files
 from loopcal.io.core.yaml_file import Location, YamlFile, refuse_unknown_keys
@@ -851,7 +851,7 @@ def read_observations(
     members: Sequence[tuple[int, ...]],
     context: Mapping[str, FloatArray],
     pose_context: Mapping[str, FloatArray],
-) -> tuple[Observations, tuple[str, ...]]:
+) -> tuple[Observations, Places]:
     """Read the rows of one kind; return them with file and line of each.
 
     `members` are the poses of each row of the file; `context` and `pose_context` times and
@@ -889,7 +889,7 @@ def read_observations(
             instrument=entry.instrument,
             noise_parts=parts,
         )
-    return observations, table.places(rows.tolist())
+    return observations, table.places(rows)
 
 
 def _read_entry(
@@ -979,6 +979,7 @@ def _read_values(
     """Return measured values (r, c), the covariance (r, m, m) of their residuals [SI], and its
     parts where the file states them.
     """
+    from loopcal.measure.array_checks import drop_repeats
     from loopcal.measure.observations import NoisePart
 
     kind, rows = entry.kind, entry.rows
@@ -996,14 +997,18 @@ def _read_values(
     sigma = np.zeros(absent.shape)
     for i in range(absent.shape[1]):
         sigma[:, i] = _read_sigma(table, robot, entry, i, absent[:, i])
+    N = drop_repeats(kind.linearize_noise(measured))
+    if np.all(sigma == sigma[:1]):  # rows with equal noise share one matrix
+        sigma = sigma[:1]
     covariance = sigma[:, :, None] * np.eye(sigma.shape[1]) * sigma[:, None, :]
     for i, a in enumerate(kind.noise_columns):
         for j, b in enumerate(kind.noise_columns):
             name = name_covariance(a.name, b.name, robot)
             if i != j and name in table.units:
+                covariance = np.array(np.broadcast_to(covariance, (len(rows), *N.shape[1:])))
                 covariance[:, i, j] = covariance[:, j, i] = known[name].parse(table)[rows]
-    N = kind.linearize_noise(measured)
     covariance = N @ covariance @ np.swapaxes(N, -1, -2)
+    covariance = np.broadcast_to(covariance, (len(rows), *N.shape[1:]))
     of_columns = {entry.sizes.get(column.name) for column in kind.noise_columns}
     is_alike = len(of_columns) == 1 and all(SIGMA + name not in table.units for name in names)
     parts = [NoisePart("", covariance, of_columns.pop() if is_alike else None)]
@@ -1025,9 +1030,8 @@ def _read_names(table: Table, name: str, rows: IntArray) -> NDArray[np.str_]:
     usual = str(stated if stated is not None else "").strip()
     if name not in table.units:
         return np.full(len(rows), unicodedata.normalize("NFC", usual))
-    cells = table.text(name)
-    texts = (unicodedata.normalize("NFC", cells[row] or usual) for row in rows.tolist())
-    return np.array(list(texts), dtype=np.str_)
+    cells = [unicodedata.normalize("NFC", cell or usual) for cell in table.text(name)]
+    return np.array(cells, dtype=np.str_)[rows]
 
 
 def _read_sigma(

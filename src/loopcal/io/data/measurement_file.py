@@ -25,7 +25,7 @@ from loopcal.errors import DataError, FileError, suggest_names
 from loopcal.estimate.determinable_setup import fix_undetermined_setup
 from loopcal.findings import Finding, report_finding
 from loopcal.frozen_dataclass import dataclass, replace
-from loopcal.io.core.csv_table import Table, read_table, read_template, require_columns
+from loopcal.io.core.csv_table import Places, Table, read_table, read_template, require_columns
 from loopcal.io.core.text_file import as_path, name_files
 from loopcal.io.core.yaml_file import find_reference
 from loopcal.io.data.columns import (
@@ -314,7 +314,7 @@ def _read_readings(file: _File, robot: Mechanism, several: bool) -> _File:
     readings = np.full(file.readings.shape, np.nan)
     chosen, own = [file.first[name] for name in file.first if name in read], len(columns)
     if controller is not None and chosen:
-        poses, places = [names[row] for row in chosen], table.places(chosen)
+        poses, places = [names[row] for row in chosen], table.places(np.array(chosen))
         solution = solve_commanded_poses(controller, rows[chosen, :own], poses, places)
         readings[chosen] = solution.q
     for i, actuator in enumerate(robot.actuators):
@@ -581,11 +581,13 @@ def join_tables(
             base_observations=tuple(rows for rows, _ in on_base),
             **{c.attribute: _read_pose_column(c, files, labels) for c in POSE_COLUMNS},
         )
-        first: dict[int, str] = {}  # place of the first row of each pose, such as `data.csv:12`
-        for rows, places in reversed(of_poses):
-            repeated = [place for place in places for _ in range(rows.kind.poses_per_row)]
-            first |= zip(rows.rows.ravel()[::-1].tolist(), reversed(repeated), strict=True)
-        check_strokes(data, robot, allow=allow_outside_stroke, places=first)
+        table, row = np.full((2, len(labels)), -1)  # of the first row of each pose
+        for number, of_file in reversed(list(enumerate(read))):
+            for rows, places in reversed(of_file):
+                if not rows.kind.is_of_base:
+                    poses = rows.rows.reshape(len(rows), -1)[::-1]
+                    table[poses], row[poses] = number, places.rows[::-1, None]
+        check_strokes(data, robot, allow=allow_outside_stroke, places=Places(tables, table, row))
         check_duplicates(data, allow=allow_duplicates, places=[at for _, at in of_poses + on_base])
     # Poses that only an unfilled sheet names were planned, not measured.
     is_named = np.zeros(len(labels), dtype=bool)
@@ -625,7 +627,7 @@ def load_poses(path: str | Path, robot: Mechanism) -> FloatArray:
     )
 
 
-def load_pose_names(path: str | Path) -> tuple[tuple[str, ...], tuple[str, ...]]:
+def load_pose_names(path: str | Path) -> tuple[tuple[str, ...], Sequence[str]]:
     """Read the names of commanded poses (n,), "1", "2", ... without a column `pose`, and their
     places such as `poses.csv:12`; FileError where a name occurs twice.
     """
@@ -637,7 +639,7 @@ def load_pose_names(path: str | Path) -> tuple[tuple[str, ...], tuple[str, ...]]
             row = first[name] + 1
             sentence = f"pose {name!r} is also row {row}. Give each pose a separate name"
             raise table.row_error(i, sentence)
-    return names, tuple(map(table.place, range(len(names))))
+    return names, table.places(np.arange(len(names)))
 
 
 def read_tables(path: Paths) -> tuple[Table, ...]:

@@ -15,7 +15,7 @@ from pathlib import Path
 from loopcal.errors import FileError
 from loopcal.findings import Finding, report_finding
 from loopcal.frozen_dataclass import dataclass, replace
-from loopcal.io.core.csv_table import Table, format_header, format_row, read_table, require_columns
+from loopcal.io.core.csv_table import Cells, Table, format_header, format_row, read_table, require_columns
 from loopcal.io.core.text_file import read_text
 from loopcal.io.data.kind_settings import KindRows, read_kinds
 from loopcal.io.data.measurement_file import join_tables, read_tables
@@ -73,7 +73,7 @@ def fill_sheet(
     misfits: list[tuple[str, int, str]] = []
     unknown: list[str] = []
     identical: list[str] = []
-    has_sessions = len(exports) > 1 and not has_one_session
+    has_sessions, poses = len(exports) > 1 and not has_one_session, set(table.pose_names())
     for export in exports:
         of_export, rows = _read_points(Path(export), profile, entry, table, by_order, misfits)
         for name, unit in of_export.items():  # the profile is one
@@ -83,7 +83,7 @@ def fill_sheet(
         if has_sessions:
             units.setdefault("session", None)
         for pose, row in rows:
-            if pose not in table.pose_names():
+            if pose not in poses:
                 unknown += [name_point(pose, t, targets) for t in _list_measured(row, targets)]
                 continue
             cells = {"session": Path(export).stem, **row} if has_sessions else row
@@ -249,7 +249,7 @@ def _read_measurements(
 ) -> Measurements:
     """Return the measurements of a filled sheet, without the poses that have no measured value."""
     lines = dict(zip(table.pose_names(), table.lines, strict=True))
-    columns = {name: tuple(row.get(name, "") for row in body) for name in header}
+    columns = {name: Cells(["\n".join(row.get(name, "") for row in body)]) for name in header}
     of_rows = tuple(lines[pose] for pose in columns["pose"])
     filled = replace(table, units=header, columns=columns, lines=of_rows)
     others = read_tables(table.path)[1:]

@@ -64,7 +64,7 @@ def read_stops(path: str | Path, robot: Mechanism) -> Stops:
     if others := tuple(name for name in robot.controlled if name not in WORDS):
         code = "files.no-gcode-word"
         raise DataError(report_finding(code, robot=robot.name, names=others, words=tuple(WORDS)))
-    return table.text("pose"), uses, np.column_stack(columns)
+    return table.pose_names(), uses, np.column_stack(columns)
 
 
 def format_gcode(
