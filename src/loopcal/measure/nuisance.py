@@ -183,9 +183,10 @@ def collect_nuisance_parameters(
             for parameter, name in zip(own, names[key], strict=True):
                 in_sessions.setdefault(parameter.name, []).append(name)
         order = {name: i for i, name in enumerate(entries)}
-        used = [[order[name] for name in names[key]] for key in keys]
+        used = {key: tuple(order[name] for name in names[key]) for key in names}
         shape = (len(keys), len(kind.nuisance_parameters))
-        indices.append(np.array(used, dtype=np.intp).reshape(shape))
+        of_rows = [used[key] for key in keys]
+        indices.append(np.array(of_rows, dtype=np.intp).reshape(shape))
     for stated in stated_values:
         names = [stated.name] if stated.name in entries else in_sessions.get(stated.name, [])
         for name in names:

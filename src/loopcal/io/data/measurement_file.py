@@ -585,7 +585,7 @@ def join_tables(
         for number, of_file in reversed(list(enumerate(read))):
             for rows, places in reversed(of_file):
                 if not rows.kind.is_of_base:
-                    poses = rows.rows.reshape(len(rows), -1)[::-1]
+                    poses = rows.rows.reshape(-1, rows.kind.poses_per_row)[::-1]
                     table[poses], row[poses] = number, places.rows[::-1, None]
         check_strokes(data, robot, allow=allow_outside_stroke, places=Places(tables, table, row))
         check_duplicates(data, allow=allow_duplicates, places=[at for _, at in of_poses + on_base])
