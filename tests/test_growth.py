@@ -132,6 +132,21 @@ def test_a_table_holds_a_few_objects_whatever_its_length(tmp_path) -> None:
     assert len(gc.get_objects()) - before < 100  # each collection of garbage visits all of them
 
 
+def test_a_table_takes_little_more_memory_than_its_text(tmp_path) -> None:
+    file = tmp_path / "data.csv"
+    head = ",".join(["pose", *(f"c{i} [mm]" for i in range(20))])
+    lines = (f"p{i}" + f",{i % 90}.123456" * 20 for i in range(5000))
+    file.write_text("\n".join([head, *lines]) + "\n", encoding="utf-8")
+    tracemalloc.start()
+    table = read_table(file)
+    held, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    size = file.stat().st_size
+    assert held < 1.6 * size  # a tuple of texts for each column takes 6 times the file
+    assert peak < 3.5 * size
+    assert table.text("c3")[4321] == f"{4321 % 90}.123456"
+
+
 def test_held_out_poses_are_checked_in_time_proportional_to_their_number() -> None:
     def make(n: int) -> Callable[[], object]:
         is_held_out = np.arange(n) % 2 == 0

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rows of one kind: whitening, missing components, weights and refusals."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -92,3 +94,13 @@ def test_arrays_are_read_only_copies():
 def test_100000_rows_are_whitened():
     data = Observations.from_sigma(POSE, np.arange(100_000), np.zeros((100_000, 6)), 1e-3)
     assert_allclose(data.whitener[99_999], 1e3 * np.eye(6), rtol=1e-12)
+
+
+def test_rows_of_equal_noise_share_one_matrix_also_when_some_are_taken() -> None:
+    measured = np.random.default_rng(1).normal(0.0, 0.01, (500, 6))
+    rows = Observations.from_sigma(POSE, np.arange(500), measured, [5e-6] * 3 + [1e-6] * 3)
+    apart = replace(rows, covariance=np.array(rows.covariance), weight=np.r_[np.ones(499), 2.0])
+    for each in (rows, rows.take(measured[:, 0] > 0.0), rows.take(np.arange(3))):
+        assert each.covariance.strides[0] == each.whitener.strides[0] == 0
+        assert_allclose(each.whitener[:2], apart.whitener[:2], rtol=1e-15)  # rounding of a product
+    assert apart.whitener.strides[0] > 0  # one row has another weight

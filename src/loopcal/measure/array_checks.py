@@ -74,7 +74,7 @@ def take_rows(array: FloatArray, rows: IntArray | BoolArray) -> FloatArray:
     """
     if not array.size or array.strides[0]:
         return array[rows]
-    count = np.count_nonzero(rows) if rows.dtype == bool else len(rows)
+    count = int(np.count_nonzero(rows)) if rows.dtype == bool else len(rows)
     return np.broadcast_to(array[0], (count, *array.shape[1:]))
 
 

@@ -137,11 +137,7 @@ def describe_outside_strokes(
 
 
 def check_strokes(
-    measurements: Measurements,
-    robot: Mechanism,
-    *,
-    allow: bool = False,
-    places: Sequence[str] = (),
+    measurements: Measurements, robot: Mechanism, *, allow: bool = False, places: Sequence[str] = ()
 ) -> None:
     """Refuse readings outside the stroke of their actuator, unless they are allowed."""
     check_actuators(measurements, robot)

@@ -85,9 +85,12 @@ def read_bytes(path: str | Path, what: str, limit: FileLimit = PROGRAM_SIZE) -> 
     large.
     """
     with open_bytes(path, what) as stream:
-        limit.check(os.fstat(stream.fileno()).st_size, what, path)
-        raw = stream.read(limit.count + 1)
-    if len(raw) > limit.count:  # the file grew, or the system does not state its size
+        size = os.fstat(stream.fileno()).st_size
+        limit.check(size, what, path)
+        raw = stream.read(size + 1)
+        if len(raw) > size:  # the file grew, or the system does not state its size
+            raw += stream.read(limit.count + 1 - size)
+    if len(raw) > limit.count:
         raise limit.make_error(what, path)
     return raw
 
