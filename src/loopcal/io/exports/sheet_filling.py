@@ -15,7 +15,14 @@ from pathlib import Path
 from loopcal.errors import FileError
 from loopcal.findings import Finding, report_finding
 from loopcal.frozen_dataclass import dataclass, replace
-from loopcal.io.core.csv_table import Cells, Table, format_header, format_row, read_table, require_columns
+from loopcal.io.core.csv_table import (
+    Cells,
+    Table,
+    format_header,
+    format_row,
+    read_table,
+    require_columns,
+)
 from loopcal.io.core.text_file import read_text
 from loopcal.io.data.kind_settings import KindRows, read_kinds
 from loopcal.io.data.measurement_file import join_tables, read_tables
