@@ -135,12 +135,19 @@ def test_gain_of_every_swap_and_addition_equals_that_of_the_new_design(criterion
         return scoring.score(scoring.factor(X[chosen]))
 
     chosen = np.array([0, 3, 4, 7, 9])
-    terms = compute_swap_terms(scoring, scoring.factor(X[chosen]), X)
+    R = scoring.factor(X[chosen])
+    terms, slopes = (
+        compute_swap_terms(scoring, R, X),
+        compute_slopes(X, find_slope_columns(scoring, R)),
+    )
     # in logs: rounding of well-conditioned 6 x 6 systems
     for j, out in enumerate(chosen):
         designs = [np.concatenate([np.delete(chosen, j), [k]]) for k in range(len(X))]
         anew = [score(design) - score(chosen) for design in designs]
-        assert_allclose(score_swaps(terms, out), anew, atol=1e-9)
+        gains = score_swaps(terms, out)
+        assert_allclose(gains, anew, atol=1e-9)
+        assert_allclose(score_swaps(terms, out, np.array([2, 5])), gains[[2, 5]], atol=1e-12)
+        assert (gains <= slopes - slopes[out] + 1e-9).all()  # the score is concave
     terms = compute_swap_terms(scoring, scoring.factor(X[:4]), X)
     anew = [score([0, 1, 2, 3, k]) - score([0, 1, 2, 3]) for k in range(len(X))]
     assert_allclose(score_additions(terms), anew, atol=1e-9)
