@@ -408,3 +408,35 @@ def test_json_lists_sources_with_the_variance_of_every_parameter():
     assert content["frame"] == "fitted"
     halved = [line["halved"] for line in content["sources"] if line["kind"] == "instrument"]
     assert halved[0]["position_rms"] < content["position"]["rms"]
+
+
+def test_sources_of_all_sessions_add_up_and_no_decomposition_grows_with_the_sessions(monkeypatch):
+    """Frames and targets of every session: the largest decomposition is one of a session."""
+    sizes: list[int] = []
+
+    def record(decompose):
+        return lambda a, *rest, **how: (
+            sizes.append(min(a.shape[-2:])),
+            decompose(a, *rest, **how),
+        )[1]
+
+    robot, n = lc.load_robot("hexapod-42"), 48
+    kind = Position(targets=("a", "b", "c"), places=PLACES, unknown=("frame", "targets"))
+    truth = robot.with_values(sample_truth(robot, 1, 0)[0])
+    poses = sample_workspace(robot, n, 1).coordinates
+    for sessions in (4, 8):
+        day = np.array([f"day {i * sessions // n}" for i in range(n)])
+        sensor = Sensor(kind, noise(*[10 * UM] * 9), session=day)
+        data = simulate(truth, poses, Instrument((sensor,)), 1)
+        linear = linearize_fit(identify(robot, data), data)
+        with monkeypatch.context() as patch:
+            patch.setattr(np.linalg, "svd", record(np.linalg.svd))
+            patch.setattr(np.linalg, "qr", record(np.linalg.qr))
+            split = split_covariance(linear)
+        of_rows = ("instrument", "setup", "tolerances")
+        roots = [r for s, r in zip(split.sources, split.roots, strict=True) if s.kind in of_rows]
+        along = linear.decomposition.directions[0][:, linear.is_estimated].T
+        parts = [along @ (root / linear.fit.tolerance[:, None]) for root in roots]
+        variance = np.diag(linear.variance[linear.is_estimated])
+        assert np.allclose(sum(x @ x.T for x in parts), variance, rtol=0.0, atol=1e-9)
+    assert max(sizes) == len(robot.parameters.names)

@@ -12,7 +12,7 @@ weights changed, not from the part of the source. See docs/theory/uncertainty.md
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any, ClassVar, NamedTuple
 
@@ -32,6 +32,8 @@ from loopcal.errors import MechanismError
 from loopcal.estimate.fit_linearization import (
     FitLinearization,
     RowSources,
+    SourceFactor,
+    divide_by_cluster,
     find_share,
     fold_sources,
     linearize_fit,
@@ -50,6 +52,7 @@ from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.solutions import Solution
 from loopcal.mechanism.workspace import sample_workspace
 from loopcal.numerics.decomposition import are_nonzero, substitute_backward
+from loopcal.numerics.elimination import TreeElimination
 from loopcal.numerics.statistics import find_distinct
 from loopcal.results.description import OTHER, Field, fields, label_axes
 from loopcal.results.result import DrawnResult
@@ -148,25 +151,29 @@ def split_covariance(linear: FitLinearization) -> CovarianceSplit:
 
     sources = [state(*key, size, evaluation, of_noise) for key, size in names.items()]
     factors = fold_sources(linear.problem, linear.linearization, members, len(names))
-    U = factors[0].shape[1] - len(fit.names)
-    common = list_common_errors(linear.problem)
-    for (kind, name), rows in _list_further_rows(linear, U, common):
+    common, estimate = list_common_errors(linear.problem), linear.linearization.nuisance
+    for (kind, name), rows in _list_further_rows(linear, common):
         size = _find_common_size(linear, common, name) if kind == COMMON else None
+        factors += divide_by_cluster(len(sources), rows, len(fit.names), estimate)
         sources.append(state(kind, name, size, "B", np.inf))
-        factors.append(rows)
-    own, moved = _propagate(linear, factors, U)
+    own = _propagate(linear, factors)
     evaluation_of_size = "B (assumed)" if fit.free_parameters.assumed.any() else "B"
     evaluation_of_size = "A and B" if np.isfinite(of_size) else evaluation_of_size
     sources.append(Source(TOLERANCES, "", evaluation_of_size, of_size))
-    is_common = np.array([source.kind == COMMON for source in sources])
+    noise_of = [sources[factor.source] for factor in factors]
+    kept = np.array([source.kind != COMMON for source in noise_of])
     is_setup = np.array([not name for name in common], dtype=bool)
-    rest, of_setup = _separate_setup(own, moved, linear.linearization, is_common, is_setup)
+    rest, of_setup = own, own[0][:, :0]
+    if estimate is not None:
+        given = own, factors, kept, is_setup
+        rest, of_setup = _separate_setup(*given, estimate.elimination, noise)
+    by_source = [*zip([*noise_of, sources[-1]], rest, strict=True)]
+    by_source += [(source, own[0][:, :0]) for source in sources]  # also those without rows
     if is_setup.any():  # rows of stated setup parameters act by these alone
-        sources.append(Source(SETUP, "", evaluation, of_noise))
-        rest.append(of_setup)
+        by_source.append((Source(SETUP, "", evaluation, of_noise), of_setup))
     merged: dict[Source, list[FloatArray]] = {}
-    setup = next((source for source in sources if source.kind == SETUP), None)
-    for source, root in zip(sources, rest, strict=True):
+    setup = next((source for source, _ in by_source if source.kind == SETUP), None)
+    for source, root in by_source:
         key = setup if source.kind == SETUP and setup is not None else source
         merged.setdefault(key, []).append(root)
     for part in (part for part in fit.posterior.parts if part.is_added):
@@ -177,7 +184,12 @@ def split_covariance(linear: FitLinearization) -> CovarianceSplit:
             name = "position" if is_place else "orientation"
         key = Source(part.source, name, "A", part.degrees)
         merged.setdefault(key, []).append(part.root / fit.tolerance[:, None])
-    roots = tuple(fit.tolerance[:, None] * np.concatenate(each, axis=1) for each in merged.values())
+    joined = (np.concatenate(each, axis=1) for each in merged.values())
+    # what many rows do is as well a root of as many columns as parameters
+    short = (
+        np.asarray(np.linalg.qr(x.T, mode="r")).T if x.shape[1] > len(x) else x for x in joined
+    )
+    roots = tuple(fit.tolerance[:, None] * root for root in short)
     return CovarianceSplit(tuple(merged), roots, np.isinf(np.diag(fit.covariance)), numbered)
 
 
@@ -220,7 +232,8 @@ def _halve_sigma(
     if fit.options.prior is not None:
         linearization = fit.options.prior.added(problem).append(linearization)
     p = len(fit.names)
-    own, _ = _propagate(linear, [linearization.factor[0, :p, :p]], 0, weight)
+    factor = linearization.factor[0, :p, :p]
+    own = _propagate(linear, divide_by_cluster(0, factor, p, None), weight)
     return fit.tolerance[:, None] * np.concatenate(own, axis=1), linearization, problem
 
 
@@ -291,7 +304,7 @@ def list_common_errors(problem: Problem) -> list[str]:
 
 
 def _list_further_rows(
-    linear: FitLinearization, U: int, common: list[str]
+    linear: FitLinearization, common: list[str]
 ) -> list[tuple[tuple[str, str], FloatArray]]:
     """Return kind, name and rows (m, U + p) of stated setup parameters, of common errors, and of an
     earlier calibration.
@@ -313,15 +326,16 @@ def _list_further_rows(
             linear.linearization.deviation, linear.linearization.next_start
         )
         slope = prior.added(problem).list_slopes(measured)[0]
-        rows.append(((EARLIER, ""), np.concatenate([np.zeros((len(slope), U)), slope], axis=1)))
+        nothing = np.zeros((len(slope), len(common)))
+        rows.append(((EARLIER, ""), np.concatenate([nothing, slope], axis=1)))
     return rows
 
 
 def _propagate(
-    linear: FitLinearization, factors: list[FloatArray], U: int, weight: float = 1.0
-) -> tuple[list[FloatArray], list[FloatArray]]:
-    """Return for each source of rows, and for the tolerances at the end, the error of the machine
-    (p, k) [tolerances] and that of the setup parameters at a known machine (U, k).
+    linear: FitLinearization, factors: Sequence[SourceFactor], weight: float = 1.0
+) -> list[FloatArray]:
+    """Return for each factor of rows, and for the tolerances at the end, the error of the machine
+    (p, k) [tolerances].
 
     With [A; P^(1/2)] = Q R, b A_k' is R^-1 Q_k'. A'A is never formed. A direction that is not
     estimated has its tolerance. The penalty P is that of the fit times a weight.
@@ -330,45 +344,83 @@ def _propagate(
     to_z = linear.decomposition.directions[0]
     penalty = np.diag(np.sqrt(weight * np.where(used, linear.penalty[0], 1.0)))
     spread = np.where(used, linear.spread, 1.0)
-    own = [factor[:, U:] @ to_z * used for factor in factors]
+    own = [factor.machine @ to_z * used for factor in factors]
     Q, R = np.linalg.qr(np.concatenate([*own, penalty]))
     *of_rows, of_penalty = np.split(Q, np.cumsum([len(rows) for rows in own]))
     whitened = [*(noise * q.T for q in of_rows), (of_penalty * spread[:, None]).T]
-    errors = [to_z @ substitute_backward(R, each) for each in whitened]
-    moved = [noise * factor[:, :U].T for factor in factors]
-    return errors, [*moved, np.zeros((U, len(penalty)))]
+    return [to_z @ substitute_backward(R, each) for each in whitened]
 
 
 def _separate_setup(
     errors: list[FloatArray],
-    moved: list[FloatArray],
-    linearization: Linearization,
-    is_common: BoolArray,
+    factors: Sequence[SourceFactor],
+    kept: BoolArray,
     is_setup: BoolArray,
+    done: TreeElimination,
+    noise: float,
 ) -> tuple[list[FloatArray], FloatArray]:
-    """Return the errors of the machine that are uncorrelated with those of the setup parameters, by
-    source, and a root (p, k) of the others.
+    """Return the errors e (p, k) of the machine that are uncorrelated with those of the setup
+    parameters, for each factor and for the tolerances, and a root (p, r + p) of the others.
 
-    Sources that are common errors of an instrument stay whole: they also move frames, and would
-    seem to be errors of these. is_setup : (U,) parameters that are no such errors.
+    Factors that are not `kept`, common errors of an instrument, stay whole: they also move frames,
+    and would seem to be errors of these. is_setup : (U,) parameters that are no such errors.
+    noise : factor on the stated sigmas of rows.
+
+    The setup parameters move by W = D + S e, with D in blocks, one for each cluster. With
+    D = V s Q', the rows of W are spanned by Q' + (V'S / s) e = Q' + H e, and by N e where s is
+    zero. With y = e Q and e - y Q' = F Z, a vector Q a + Z' b is without part in these rows if
+
+        a = -H t,  (1 + y H) t = F b,  N t = 0,
+
+    a null space of p unknowns t and b, however many clusters there are.
     """
-    estimate = linearization.nuisance
-    if estimate is None:
-        return list(errors), np.zeros((len(errors[0]), 0))
-    done, kept = estimate.elimination, np.flatnonzero(~is_common)
-    e, motion = (np.concatenate([of[i] for i in kept], axis=1) for of in (errors, moved))
-    setup = done.slope[0][is_setup] @ e + done.joint_root()[0][is_setup] @ motion
-    length = np.linalg.norm(setup, axis=1, keepdims=True)
-    Q, R = np.linalg.qr((setup / np.where(length > 0.0, length, 1.0)).T)
-    u, s, _ = np.linalg.svd(R)
-    basis = Q @ u[:, are_nonzero(s)] if s.size and s[0] > 0.0 else np.zeros((e.shape[1], 0))
-    of_setup = e @ basis
-    rest = e - of_setup @ basis.T
-    ends = np.cumsum([errors[i].shape[1] for i in kept])[:-1]
-    separated = list(errors)
-    for i, part in zip(kept, np.split(rest, ends, axis=1), strict=True):
-        separated[i] = part
-    return separated, of_setup
+    p, slope = len(errors[0]), done.slope[0]
+    members: dict[int, list[int]] = {}
+    for i in np.flatnonzero(kept).tolist():
+        cluster = done.tree.cluster[factors[i].unknowns[:1]]
+        members.setdefault(int(cluster[0]) if len(cluster) else -1, []).append(i)
+    members.setdefault(-1, []).append(len(factors))
+    order = [i for group in members.values() for i in group]
+    left, Q, H, N, y = {i: errors[i] for i in order}, {}, [], [np.zeros((0, p))], []
+    for c, group in members.items():
+        unknowns = np.flatnonzero((done.tree.cluster == c) & is_setup)
+        if c < 0 or not len(unknowns):
+            continue
+        whole = factors[group[0]].unknowns
+        motion = noise * np.concatenate([factors[i].setup for i in group]).T
+        D = done.joint_root(whole)[0][is_setup[whole]] @ motion
+        e = np.concatenate([errors[i] for i in group], axis=1)
+        length = np.sqrt((D**2).sum(axis=1) + ((slope[unknowns] @ e) ** 2).sum(axis=1))
+        length = np.where(length > 0.0, length, 1.0)[:, None]
+        V, s, Qt = np.linalg.svd(D / length)
+        rank = int(are_nonzero(s).sum()) if s[0] > 0.0 else 0
+        turned = V.T @ (slope[unknowns] / length)
+        H.append(turned[:rank] / s[:rank, None])
+        N.append(turned[rank:])
+        y.append(e @ Qt[:rank].T)
+        ends = np.cumsum([errors[i].shape[1] for i in group])[:-1]
+        for i, inside in zip(group, np.split(Qt[:rank], ends, axis=1), strict=True):
+            Q[i] = len(H) - 1, inside
+            left[i] = errors[i] - y[-1] @ inside
+    if not H:
+        return list(errors), np.zeros((p, 0))
+    Z, F = np.linalg.qr(np.concatenate([left[i] for i in order], axis=1).T)
+    rows, inner = np.concatenate(H), np.concatenate([*y, F.T], axis=1)
+    conditions = np.block([[np.eye(p) + inner[:, : len(rows)] @ rows, -F.T]])
+    absent = np.concatenate(N)
+    absent = np.concatenate([absent, np.zeros((len(absent), F.shape[0]))], axis=1)
+    _, s, vt = np.linalg.svd(np.concatenate([conditions, absent]))
+    null = vt[int(are_nonzero(s).sum()) :].T
+    free = np.linalg.qr(np.concatenate([-rows @ null[:p], null[p:]]))[0]
+    along = inner @ free
+    separated, first = list(errors), np.cumsum([0, *(len(each) for each in H)])
+    ends = np.cumsum([errors[i].shape[1] for i in order])[:-1]
+    for i, outside in zip(order, np.split(Z, ends), strict=True):
+        separated[i] = along @ (free[first[-1] :].T @ outside.T)
+        if i in Q:
+            block, inside = Q[i]
+            separated[i] += along @ (free[first[block] : first[block + 1]].T @ inside)
+    return separated, inner - along @ free.T
 
 
 class ErrorSources(NamedTuple):

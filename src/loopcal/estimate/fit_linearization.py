@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from loopcal import engine
-from loopcal.estimate.elimination import NodeRows, divide_among_nodes
+from loopcal.estimate.elimination import EliminatedNuisance, NodeRows, divide_among_nodes
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.identification import prepare_fitted_data
 from loopcal.estimate.linearization import KindRows, Linearization, PoseSolution
@@ -39,6 +39,7 @@ from loopcal.measure.measurements import Measurements
 from loopcal.mechanism.model import Mechanism
 from loopcal.numerics.decomposition import Decomposition
 from loopcal.numerics.elimination import eliminate_columns
+from loopcal.numerics.statistics import find_distinct
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
 
@@ -266,23 +267,34 @@ def find_share(parts: RowSources, source: int, rows: IntArray | slice = slice(No
     return np.asarray(share)
 
 
+class SourceFactor(NamedTuple):
+    """A triangular factor of rows of one source that move the setup parameters of one cluster.
+
+    Attributes
+    ----------
+    source : its number. unknowns : (u,) the setup parameters. setup : (m, u) rows by these, in
+        units of their standard deviations. machine : (m, p) by the machine.
+    """
+
+    source: int
+    unknowns: IntArray
+    setup: FloatArray
+    machine: FloatArray
+
+
 def fold_sources(
     problem: Problem, linearization: Linearization, sources: Sequence[RowSources], count: int
-) -> list[FloatArray]:
-    """Return triangular factors (m, U + p) of the rows of each of `count` sources (one machine).
-
-    `sources` are those of every kind. The first U columns are in units of the standard deviations
-    of the nuisance parameters, those of the machine follow them. A factor has a row for each column
-    in which its source has values: a session has none in the columns of other sessions, so that
-    time and memory grow with the sessions, not with their cube.
+) -> list[SourceFactor]:
+    """Return triangular factors of the rows of each of `count` sources (one machine), one for each
+    cluster of setup parameters that they move, so that time and memory grow with the sessions, not
+    with their cube. `sources` are those of every kind.
     """
     z, p = linearization.deviation, problem.parameters
     estimate, poses = linearization.nuisance, problem.poses
     fixed = None if estimate is None else estimate.values
     at_nodes = None if estimate is None else estimate.elimination.at_nodes
     solution = poses.solve(z, problem.trials, linearization.next_start, problem.control, fixed)
-    wide = 0 if problem.nuisance is None else len(problem.nuisance)
-    factors = [np.zeros((0, wide + p + 1))] * count
+    folded: dict[tuple[int, int], SourceFactor] = {}
     for block, linearized in poses.iterate_poses(solution, z):
         kinds = poses.linearize_kinds(block, linearized, problem.trials, fixed)
         for source in range(count):
@@ -294,20 +306,35 @@ def fold_sources(
                 continue
             node_rows = _select_rows(poses, block, kinds, own)
             for part in spread_rows(poses, block, node_rows, p, at_nodes):
-                rows = part.rows.reshape(-1, wide + p + 1)
-                factors[source] = _fold_used(factors[source], rows)
-    return [factor[:, :-1][factor[:, :-1].any(axis=1)] for factor in factors]
+                rows = part.rows.reshape(-1, part.rows.shape[2])[:, :-1]
+                for factor in divide_by_cluster(source, rows, p, estimate):
+                    key = source, int(factor.unknowns[0]) if len(factor.unknowns) else -1
+                    folded[key] = _fold_together(folded.get(key), factor)
+    return [folded[key] for key in sorted(folded)]
 
 
-def _fold_used(factor: FloatArray, rows: FloatArray) -> FloatArray:
-    """Return the factor (m, c) of a factor and further rows (n, c), by the columns of either that
-    have values.
-    """
-    used = np.flatnonzero(factor.any(axis=0) | rows.any(axis=0))
-    triangle = np.zeros((1, len(used), len(used)))
-    folded = np.zeros((len(used), factor.shape[1]))
-    folded[:, used] = engine.fold(triangle, np.concatenate([factor, rows])[None, :, used])[0]
-    return folded
+def divide_by_cluster(
+    source: int, rows: FloatArray, p: int, estimate: EliminatedNuisance | None
+) -> list[SourceFactor]:
+    """Return rows (n, U + p) of a source by the clusters of setup parameters that they move."""
+    if estimate is None:
+        return [SourceFactor(source, np.zeros(0, dtype=np.int64), rows[:, :0], rows)]
+    cluster, moved = estimate.elimination.tree.cluster, rows[:, :-p] if p else rows
+    of_row = np.where(moved.any(axis=1), cluster[np.argmax(moved != 0.0, axis=1)], -1)
+    factors = []
+    for c in find_distinct(of_row):
+        own, unknowns = rows[of_row == c], np.flatnonzero((cluster == c) & (c >= 0))
+        factors.append(SourceFactor(source, unknowns, own[:, unknowns], own[:, len(cluster) :]))
+    return factors
+
+
+def _fold_together(first: SourceFactor | None, other: SourceFactor) -> SourceFactor:
+    """Return the factor of rows of one source and cluster with further ones."""
+    u, parts = len(other.unknowns), [each for each in (first, other) if each is not None]
+    rows = np.concatenate([np.hstack([each.setup, each.machine]) for each in parts])
+    triangle = engine.fold(np.zeros((1, rows.shape[1], rows.shape[1])), rows[None])[0]
+    triangle = triangle[triangle.any(axis=1)]
+    return other._replace(setup=triangle[:, :u], machine=triangle[:, u:])
 
 
 def _select_rows(

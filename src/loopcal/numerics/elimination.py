@@ -359,16 +359,20 @@ class TreeElimination(TrialBatch):
         path = self.tree.structures[structure].path[places]
         return path, self.roots[structure][0][places], self.slope[0][path]
 
-    def joint_root(self) -> FloatArray:
-        """Return a square root (a, U, U) of the covariance of all unknowns at a known machine.
+    def joint_root(self, unknowns: IntArray | None = None) -> FloatArray:
+        """Return a square root (a, u, u) of the covariance, at a known machine, of all unknowns, or
+        of all of some clusters.
 
         Its columns belong to independent standard normal variables; see `roots`.
         """
-        joint = np.zeros((*self.shift.shape, self.shift.shape[1]))
+        chosen = np.arange(self.shift.shape[1]) if unknowns is None else unknowns
+        place = np.full(self.shift.shape[1], -1)
+        place[chosen] = np.arange(len(chosen))
+        joint = np.zeros((len(self.shift), len(chosen), len(chosen)))
         for structure, root in zip(self.tree.structures, self.roots, strict=True):
-            u = structure.unknowns.shape[1]
-            rows, columns = structure.unknowns[:, :, None], structure.path[:, None, :]
-            joint[:, rows, columns] = root[:, :, :u]
+            nodes, u = place[structure.unknowns[:, 0]] >= 0, structure.unknowns.shape[1]
+            rows, columns = place[structure.unknowns[nodes]], place[structure.path[nodes]]
+            joint[:, rows[:, :, None], columns[:, None, :]] = root[:, nodes, :u]
         return joint
 
     def null_directions(self) -> FloatArray:
