@@ -30,7 +30,9 @@ NEAREST = 1e-3
 """Share of the distance from the camera below which the depth of a point is not taken, so that a
 point beside or behind the camera has a large, finite residual that leads back."""
 FEWEST = 4  # points of a picture that determine the pose of a board
-STEPS, HALVINGS, CHANGE = 40, 10, 1e-8  # of the descent; a relative change that ends it
+STEPS, HALVINGS, CHANGE = 40, 6, 1e-8  # of the descent; a relative change that ends it
+FEW_STEPS = 10  # of the descent to the pose of a board from a closed form
+ROUNDING = 1e-12  # relative increase of a sum of squares that is none
 
 
 def project(
@@ -180,7 +182,8 @@ def locate_boards(points: FloatArray, pixels: FloatArray, lens: FloatArray) -> F
         )
     begin = np.array(starts).reshape(-1, 4, 4)
     twice = np.repeat(pixels, 2, axis=0)
-    ends, squares = _descend(points, twice, lens, np.zeros(9, dtype=bool), begin)[1:3]
+    none = np.zeros(len(LENS), dtype=bool)
+    ends, squares = _descend(points, twice, lens, none, begin, FEW_STEPS)[1:3]
     best = np.argmin(squares.reshape(-1, 2), axis=1)
     return ends.reshape(-1, 2, 4, 4)[np.arange(len(best)), best]
 
@@ -236,7 +239,12 @@ def calibrate_camera(
 
 
 def _descend(
-    points: FloatArray, pixels: FloatArray, lens: FloatArray, free: BoolArray, poses: FloatArray
+    points: FloatArray,
+    pixels: FloatArray,
+    lens: FloatArray,
+    free: BoolArray,
+    poses: FloatArray,
+    steps: int = STEPS,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
     """Return lens, poses, sums of squares (n,), factor of the lens and residuals (n, k, 2) after
     Gauss-Newton with halved steps, poses eliminated; without a free lens, each picture by itself.
@@ -254,7 +262,7 @@ def _descend(
         return residual, (residual**2).sum(axis=(1, 2)), rows
 
     residual, squares, rows = evaluate(lens, poses)
-    for _ in range(STEPS):
+    for _ in range(steps):
         missing = max(7 + q - rows.shape[1], 0)
         padded = np.pad(rows, ((0, 0), (0, missing), (0, 0)))
         done = eliminate_columns(_factor(padded), 6)
@@ -268,9 +276,10 @@ def _descend(
             lens[free] += share[0] * change
             poses = geometry.apply_twist(first_poses, share[:, None] * twist)
             residual, squares, rows = evaluate(lens, poses)
-            worse = ~(squares <= before)
+            most = (1.0 + ROUNDING) * before
+            worse = ~(squares <= most)
             if q:  # all pictures move together
-                worse = np.full_like(worse, not squares.sum() <= before.sum())
+                worse = np.full_like(worse, not squares.sum() <= most.sum())
             if not worse.any():
                 break
             share = np.where(worse, 0.5 * share if k < HALVINGS - 1 else 0.0, share)
