@@ -61,3 +61,20 @@ def test_many_values_are_those_of_a_few() -> None:
     many = ours.chi_square_quantile(k, 0.05)
     np.testing.assert_allclose(many[::400], ours.chi_square_quantile(k[::400], 0.05), rtol=1e-13)
     assert ours.chi_square_tail(np.zeros((0, 3)), 1.0).shape == (0, 3)
+
+
+@pytest.mark.parametrize("degrees", [1.0, 100.0, 4287.0, 1e5, 1e7])
+def test_quantile_of_any_degrees_of_freedom_takes_few_steps(monkeypatch, degrees) -> None:
+    """The rounding of thousands of degrees kept Newton's steps above the smallest one."""
+    calls, split = [], ours._split_beta
+
+    def count(*arguments):
+        calls.append(arguments)
+        return split(*arguments)
+
+    monkeypatch.setattr(ours, "_split_beta", count)
+    for probability in (0.6, 0.975, 1e-6):
+        calls.clear()
+        found = ours._find_student_quantile(degrees, probability)
+        assert found == pytest.approx(scipy.special.stdtrit(degrees, probability), rel=1e-10)
+        assert len(calls) < 80

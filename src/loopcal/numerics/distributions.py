@@ -139,12 +139,14 @@ def _split_f(degrees: float, left: float, value: float) -> Shares:
 def _find_quantile(split: Callable[[float], Shares], u: float, above: float) -> float:
     """Return u with a probability above it, by Newton's method from near the mean.
 
-    The logarithm of either probability is concave in u, so every step ends on one side.
+    The logarithm of either probability is concave in u, so every step ends on one side. Near the
+    end a step has the size of the square of the last one, or else of the rounding of thousands of
+    degrees of freedom.
     """
     if not 0.0 < above < 1.0:
         return math.inf if above <= 0.0 else -math.inf if above >= 1.0 else math.nan
     sign, number, goal = (1.0, 1, above) if above <= 0.5 else (-1.0, 0, 1.0 - above)
-    known, goal = u, math.log(goal)
+    known, goal, last = u, math.log(goal), math.inf
     for _ in range(STEPS):
         shares = split(u)
         if not shares[number] > 0.0:  # beyond the smallest number
@@ -152,8 +154,9 @@ def _find_quantile(split: Callable[[float], Shares], u: float, above: float) -> 
             continue
         step = (math.log(shares[number]) - goal) * shares[number] / shares[2]
         known, u = u, u + sign * min(max(step, -1.0), 1.0)
-        if abs(step) < 1e-14 or u == known:
+        if abs(step) < 1e-14 or u == known or 0.1 * last < abs(step) < 1e-8:
             break
+        last = abs(step)
     return u
 
 
