@@ -263,11 +263,12 @@ class _Iterate:
     count: IntArray
 
     def take(self, rows: IntArray) -> _Iterate:
-        """Return some rows, by their positions in ascending order."""
-        return self if len(rows) == len(self.u) else map_arrays(lambda a: a[rows], self)
+        """Return some rows by their positions."""
+        is_whole = np.array_equal(rows, np.arange(len(self.u)))
+        return self if is_whole else map_arrays(lambda a: a[rows], self)
 
     def put(self, rows: IntArray, new: _Iterate) -> _Iterate:
-        """Return the same rows with some replaced."""
+        """Return the same rows with some replaced, by their positions in ascending order."""
         if len(rows) == len(self.u):
             return new
 
@@ -362,8 +363,8 @@ class _Rows:
     moving: IntArray
 
     def select(self, rows: IntArray) -> _Rows:
-        """Return some rows, by their positions in ascending order."""
-        if len(rows) == len(self.target):
+        """Return some rows by their positions."""
+        if np.array_equal(rows, np.arange(len(self.target))):
             return self
 
         def chosen(a: np.ndarray) -> np.ndarray:
@@ -721,9 +722,9 @@ def _propose_state(robot: Mechanism, values: FloatArray, target: FloatArray, sta
 # The reachable pose nearest to one that takes more freedoms than the robot has: Gauss-Newton steps
 # of the drives.
 
-PROJECTION_STEPS, ATTEMPTS = 20, 5
-"""Steps of a projection, and lengths that are tried for each, the shortest 1/16 of it: a row ends
-where none of them lowers its distance, as at the end of the reach."""
+PROJECTION_STEPS, SHARES = 20, 0.5 ** np.arange(5)
+"""Steps of a projection, and shares that are tried of each: a row ends where none of them lowers
+its distance, as at the end of the reach."""
 SHORT_STEP, SHORT_SHARE = 1e-12, 1e-9
 """The last step changes the distance from the target to first order by this length, relative to the
 robot's size, and this share."""
@@ -772,8 +773,8 @@ def find_nearest_reachable(
         first = replace(first, closure_sign=compute_closure_sign(robot, values, first))
     rows, scale = _make_rows(robot, values, wanted[0, closed]), robot.twist_scale
 
-    def measure(now: _Iterate) -> _Point:
-        gap = geometry.pose_difference(now.T, T[0, closed]) * scale
+    def measure(now: _Iterate, of: IntArray | slice = slice(None)) -> _Point:
+        gap = geometry.pose_difference(now.T, T[0, closed][of]) * scale
         cost = np.where(np.isfinite(now.D).all(axis=(1, 2)), (gap**2).sum(axis=1), np.inf)
         return _Point(now, gap, cost)
 
@@ -789,14 +790,24 @@ def find_nearest_reachable(
         return _Step(drives, (change**2).sum(axis=1), LONGEST_STEP / length.clip(LONGEST_STEP))
 
     def move(point: _Point, step: _Step, share: FloatArray) -> _Point:
-        moving = np.flatnonzero(share[:, 0])
-        if not len(moving):
-            return point
-        begin, u = point.now.take(moving), point.now.u + share * step.drives
-        new = rows.select(moving).place(u[moving], begin.loops)
-        return measure(point.now.put(moving, new))
+        now, left = point.now, np.flatnonzero(share[:, 0])
+        for shares in (SHARES[:1], SHARES[1:]):
+            if not len(left):
+                break
+            # all shorter lengths at once, of which the first one counts that is no worse
+            tried = np.repeat(left, len(shares))
+            drives = (share[left] * step.drives[left])[:, None] * shares[:, None]
+            begin = point.now.take(tried)
+            new = rows.select(tried).place(begin.u + drives.reshape(begin.u.shape), begin.loops)
+            lower = ~control.is_worse(measure(new, tried).cost, point.cost[tried])
+            lower = lower.reshape(len(left), -1)
+            chosen = np.flatnonzero(lower.any(axis=1))
+            first = chosen * len(shares) + lower.argmax(axis=1)[chosen]
+            now, left = now.put(left[chosen], new.take(first)), np.delete(left, chosen)
+        return measure(now)
 
-    control = Halving(PROJECTION_STEPS, ATTEMPTS, SHORT_SHARE, SHORT_STEP * robot.size)
+    # each step is halved here, all lengths at once
+    control = Halving(PROJECTION_STEPS, 1, SHORT_SHARE, SHORT_STEP * robot.size)
     begin = _begin(rows, first)
     point, _ = minimize_by_halving(measure(begin), propose, move, control)
     smallest = np.maximum(point.cost, (REACHED * robot.size) ** 2)
