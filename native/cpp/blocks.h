@@ -86,8 +86,8 @@ INLINE Lanes gather(const double *const *from, int64_t offset) {
     return out;
 }
 
-// Joint values of a block, group by group and limb by limb: those of a state with the driven ones
-// from q (a null q leaves them). theta : (joints + 1) values of each limb.
+// Joint values of a block, group by group and limb by limb: those of a state (null joints leave
+// them) with the driven ones from q (a null q leaves them). theta : (joints + 1) values of each limb.
 inline void gather_joints(const Program &program, const loopcal::Strided *joints, const loopcal::Strided &q,
                           const int64_t *trial, const int64_t *pose, Lanes *theta) {
     const double *drive[W];
@@ -96,13 +96,15 @@ inline void gather_joints(const Program &program, const loopcal::Strided *joints
     for (int g = 0; g < program.groups; g++) {
         const Group &group = program.group[g];
         const double *from[W];
-        for (int lane = 0; lane < W; lane++) from[lane] = locate(joints[g], trial[lane], pose[lane]);
+        for (int lane = 0; joints && lane < W; lane++) from[lane] = locate(joints[g], trial[lane], pose[lane]);
         int values = group.joints + 1;
         for (int k = 0; k < group.limbs; k++)
             for (int j = 0; j < values; j++, theta++) {
                 int64_t column = group.actuator[j * group.limbs + k];
-                bool driven = q.data && group.actuator[j * group.limbs] >= 0;
-                *theta = driven ? gather(drive, column) : gather(from, k * values + j);
+                if (q.data && group.actuator[j * group.limbs] >= 0)
+                    *theta = gather(drive, column);
+                else if (joints)
+                    *theta = gather(from, k * values + j);
             }
     }
 }

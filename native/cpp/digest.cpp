@@ -31,7 +31,7 @@ int loopcal_compare_poses(int, const loopcal::Strided *, double *, double *, int
 int loopcal_solve_triangles(int, const double *, const double *, double *, double *, int64_t,
                             int64_t);
 int loopcal_solve(int, const int64_t *, const double *, const loopcal::Strided *,
-                  const loopcal::Strided *, int64_t, int64_t, int64_t, loopcal::Task, void *,
+                  const loopcal::Strided *, int64_t, int64_t, int64_t, int, loopcal::Task, void *,
                   double *, double *const *, double *, int64_t *, int8_t *, int8_t *);
 }
 
@@ -207,7 +207,7 @@ void add_kinematics(int set, bool free, int freedoms, int64_t t, int64_t n, Dige
                                  {q.data(), n * DRIVES, DRIVES}, {T.data(), 0, 0}, {nullptr, 0, 0},
                                  {nullptr, 0, 0}, {nullptr, 0, 0}};
     loopcal_solve(set, machine.structure.data(), machine.numbers.data(), arrays, given.data(), t, n,
-                  30, nullptr, nullptr, poses.data(), joints_out.data(), residual.data(),
+                  30, loopcal::APART, nullptr, nullptr, poses.data(), joints_out.data(), residual.data(),
                   iterations.data(), status.data(), sign.data());
     arrays[2] = {poses.data(), 16 * n, 16};
     loopcal_linearize(set, machine.structure.data(), machine.numbers.data(), arrays, solved.data(),
@@ -245,8 +245,8 @@ void add_kinematics(int set, bool free, int freedoms, int64_t t, int64_t n, Dige
     for (size_t g = 0; g < GROUPS; g++) digest.add(joints[g]), digest.add(rows[g]);
 }
 
-// Poses at sums of driven joints, which other trials weigh otherwise.
-void add_sums(int set, int64_t t, int64_t n, Digest &digest) {
+// Poses at sums of driven joints, which other trials weigh otherwise, apart or one after the other.
+void add_sums(int set, int64_t t, int64_t n, int order, Digest &digest) {
     Random random;
     Machine machine(random, false, 6, SHAPES, true);
     Reals e = random.reals((size_t)(t * machine.displacements), 1e-3), q = random.reals(DRIVES, 0.1), T;
@@ -266,7 +266,7 @@ void add_sums(int set, int64_t t, int64_t n, Digest &digest) {
     loopcal::Strided arrays[] = {{e.data(), machine.displacements, 0}, {q.data(), 0, 0}, {T.data(), 0, 0}, {nullptr, 0, 0},
                                  {weights.data(), DRIVES * DRIVES, 0}, {values.data(), n * DRIVES, DRIVES}};
     loopcal_solve(set, machine.structure.data(), machine.numbers.data(), arrays, given.data(), t, n,
-                  30, nullptr, nullptr, poses.data(), out.data(), residual.data(),
+                  30, order, nullptr, nullptr, poses.data(), out.data(), residual.data(),
                   iterations.data(), status.data(), sign.data());
     digest.add(poses), digest.add(residual), digest.add(iterations), digest.add(status), digest.add(sign);
     for (const Reals &of_group : joints) digest.add(of_group);
@@ -344,7 +344,8 @@ int main() {
             for (int64_t n : {1, 3, 21}) add_kinematics(set, free, 6, 13, n, digest);
         add_kinematics(set, false, 6, 1, 50, digest);
         for (const GroupShape *shapes : {SHAPES, RODS}) add_kinematics(set, true, 0, 5, 21, digest, shapes);
-        for (int64_t n : {3, 21}) add_sums(set, 5, n, digest);
+        for (int order : {loopcal::APART, loopcal::CHAINED, loopcal::ENDING})
+            for (int64_t n : {3, 21}) add_sums(set, 5, n, order, digest);
         for (bool torsion : {false, true}) add_targets(set, 5, 45, torsion, digest);
         for (int64_t n : {1, 13, 50}) add_comparisons(set, n, digest);
         for (int64_t p : {1, 7, 43}) add_factors(set, 11, 50, p, digest);

@@ -26,7 +26,7 @@ extern const loopcal::Kernels kernels;
 
 namespace {
 
-constexpr int ABI = 8;  // changes with every change of the C interface; library.py states it, too
+constexpr int ABI = 9;  // changes with every change of the C interface; library.py states it, too
 
 struct Set {
     const char *name;
@@ -113,10 +113,10 @@ EXPORT int loopcal_solve_triangles(int set, const double *triangle, const double
 
 EXPORT int loopcal_solve(int set, const int64_t *structure, const double *numbers,
                          const loopcal::Strided *arrays, const loopcal::Strided *joints, int64_t t,
-                         int64_t n, int64_t max_iterations, loopcal::Task task, void *context,
-                         double *T, double *const *joints_out, double *residual,
+                         int64_t n, int64_t max_iterations, int order, loopcal::Task task,
+                         void *context, double *T, double *const *joints_out, double *residual,
                          int64_t *iterations, int8_t *status, int8_t *sign) {
     return list_sets()[set].kernels->solve(structure, numbers, arrays, joints, t, n, max_iterations,
-                                           task, context, T, joints_out, residual, iterations,
+                                           order, task, context, T, joints_out, residual, iterations,
                                            status, sign);
 }

@@ -9,6 +9,10 @@ namespace loopcal {
 // Return values of the functions.
 enum Outcome { DONE = 0, NO_MEMORY = 1, TASK_FAILED = 2 };
 
+// Whether poses begin at the start, or each at the solution of the one before; then a trial may end at
+// the first pose that does not converge, whose status the others get.
+enum Order { APART = 0, CHAINED = 1, ENDING = 2 };
+
 constexpr int MOST_CONDITIONS = 64;  // of a task, for each row; library.py refuses more
 
 struct TaskAnswer {
@@ -69,8 +73,8 @@ struct Kernels {
     int (*solve_triangles)(const double *triangle, const double *right, double *x, double *growth,
                            int64_t t, int64_t p);
     int (*solve)(const int64_t *structure, const double *numbers, const Strided *arrays,
-                 const Strided *joints, int64_t t, int64_t n, int64_t max_iterations, Task task,
-                 void *context, double *T, double *const *joints_out, double *residual,
+                 const Strided *joints, int64_t t, int64_t n, int64_t max_iterations, int order,
+                 Task task, void *context, double *T, double *const *joints_out, double *residual,
                  int64_t *iterations, int8_t *status, int8_t *sign);
 };
 

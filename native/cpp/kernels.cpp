@@ -24,11 +24,11 @@ static int call_linearize(const int64_t *structure, const double *numbers,
 // arrays : e, q, T, goal, and of sums of driven joints weights and values
 static int call_solve(const int64_t *structure, const double *numbers,
                       const loopcal::Strided *arrays, const loopcal::Strided *joints, int64_t t,
-                      int64_t n, int64_t max_iterations, loopcal::Task task, void *context,
-                      double *T, double *const *joints_out, double *residual, int64_t *iterations,
+                      int64_t n, int64_t max_iterations, int order, loopcal::Task task,
+                      void *context, double *T, double *const *joints_out, double *residual, int64_t *iterations,
                       int8_t *status, int8_t *sign) {
     SolveInput input{arrays[0], arrays[1], arrays[2], arrays[3], joints, t, n, max_iterations,
-                     task,      context,   arrays[4], arrays[5]};
+                     task,      context,   arrays[4], arrays[5], (loopcal::Order)order};
     SolveOutput output{T, joints_out, residual, iterations, status, sign};
     return solve(structure, numbers, input, output);
 }

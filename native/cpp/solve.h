@@ -40,6 +40,24 @@ class Solver {
         return block.status == double(NEAR_GOAL);
     }
 
+    // The poses of a trial one after the other, each from the solution of the one before.
+    int run_chains(RowBlock &block) {
+        for (int64_t b = 0; b < division_.blocks(); b++) {
+            bool continues = b % division_.blocks_of_unit() != 0;
+            Lanes status = continues ? block.status : Lanes{};
+            Mask converged = status == double(CONVERGED);
+            begin(block, b, !continues);
+            if (continues && in_.order == loopcal::ENDING) {
+                block.alive &= converged;
+                block.status = select(converged, block.status, status);
+            }
+            if (any(block.alive))
+                if (int outcome = iterate(&block, 1)) return outcome;
+            write(block);
+        }
+        return 0;
+    }
+
     int close_limbs(RowBlock &block, const Frames &frames) {
         LimbCloser limbs(program_, frames);
         for (int64_t b = 0; b < division_.blocks(); b++) close(block, b, limbs);
@@ -73,19 +91,22 @@ class Solver {
         return 0;
     }
 
-    void begin(RowBlock &block, int64_t number) {
+    void begin(RowBlock &block, int64_t number, bool anew = true) {
         block.used = division_.locate(number, block.trial, block.pose);
-        start(block, number / division_.blocks_of_unit());
+        start(block, number / division_.blocks_of_unit(), anew);
     }
 
-    // Begin with the rows that a block has located in a unit.
-    void start(RowBlock &block, int64_t unit) {
+    // Begin with the rows that a block has located in a unit, `anew` or from where the block is.
+    void start(RowBlock &block, int64_t unit, bool anew = true) {
         // blocks of one chunk belong to fewer than `unit_count` units
         block.unit = unit;
         block.placed = space_.unit + unit % space_.units;
         block.placed->place(unit, in_.e);
-        gather_nodes(program_, in_.T, in_.joints + program_.groups, block.trial, block.pose, block.now);
-        gather_joints(program_, in_.joints, in_.q, block.trial, block.pose, block.now + 12 * program_.nodes);
+        if (anew) gather_nodes(program_, in_.T, in_.joints + program_.groups, block.trial, block.pose, block.now);
+        const loopcal::Strided none{}, *joints = anew ? in_.joints : nullptr;
+        // driven joints whose sums are given go on from where they are
+        const loopcal::Strided &q = anew || !program_.frees_drives ? in_.q : none;
+        gather_joints(program_, joints, q, block.trial, block.pose, block.now + 12 * program_.nodes);
         for (int lane = 0; lane < W; lane++) block.alive[lane] = lane < block.used ? -1 : 0;
         block.share = splat(1.0);
         block.applied = splat(__builtin_inf());
@@ -167,7 +188,7 @@ class Solver {
         for (int64_t b = 0; b < count; b++) {
             RowBlock &block = blocks[b];
             if (any(block.alive)) {
-                if (first && !in_.T.pose) {
+                if (first && !in_.T.pose && in_.order == loopcal::APART) {
                     evaluate_shared<Number>(block);
                     continue;
                 }
@@ -309,13 +330,14 @@ inline int solve(const int64_t *structure, const double *numbers, const SolveInp
     ProgramMemory memory(structure);
     if (!memory.ok()) return loopcal::NO_MEMORY;
     Program program(structure, numbers, memory.groups, memory.order);
-    Division division(input.t, input.n);
+    bool is_chain = input.order != loopcal::APART;
+    Division division = is_chain ? Division(input.t, input.n, true) : Division(input.t, input.n);
     int64_t blocks = 1, units = 1;
     if (input.task) {
         blocks = Solver::ROWS_OF_TASK / W < division.blocks() ? Solver::ROWS_OF_TASK / W : division.blocks();
         units = blocks / division.blocks_of_unit() + 2;
     }
-    if (!input.task && division.blocks() > 1) {
+    if (!input.task && division.blocks() > 1 && !is_chain) {
         blocks = Solver::PAIR;
         units = blocks / division.blocks_of_unit() + 2;
     }
@@ -326,7 +348,7 @@ inline int solve(const int64_t *structure, const double *numbers, const SolveInp
     Solver solver(program, input, output, division, equations, space);
     if (!program.freedoms && program.free && have_closed_form(program))
         return solver.close_limbs(*space.block, work.frames);
-    return solver.run();
+    return is_chain ? solver.run_chains(*space.block) : solver.run();
 }
 
 }  // namespace INSTRUCTION_SET

@@ -26,6 +26,7 @@ struct SolveInput {
     loopcal::Task task;
     void *context;
     loopcal::Strided weights, values;  // of sums of driven joints
+    loopcal::Order order;
 };
 
 struct SolveOutput {

@@ -5,6 +5,7 @@ other rows.
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from loopcal import geometry
 from loopcal.engine import CONVERGED, EXHAUSTED, NEAR_GOAL, NOT_FINITE, STALLED, Slot, Sums
+from loopcal.engine.numpy_engine.newton import follow_by
 from loopcal.io.robot.robot_file import load_robot
 from loopcal.mechanism.compilation import build
 from tests import zoo
@@ -87,6 +89,39 @@ def test_sums_of_driven_joints_lead_where_the_joints_do(engine, case):
     assert_same(
         take_rows(state, [0], [2]), engine.solve(case.program, case.e, start, case.home, sums=alone)
     )
+
+
+def follow(engine, *arguments, **options):
+    """Solve poses one after the other, as `loopcal.engine.follow` does by this engine."""
+    own = engine.follow or partial(follow_by, engine.solve)
+    return own(*arguments, **options)
+
+
+@pytest.mark.parametrize("has_sums", [False, True])
+def test_poses_in_a_chain_begin_at_the_one_before(engine, has_sums):
+    one = make_case(zoo.mixed_hexapod(), t=3)
+    sums, start, states = draw_sums(one) if has_sums else None, one.home, []
+    chain = follow(engine, one.program, one.e, one.q, one.home, sums=sums)
+    for i in range(one.q.shape[1]):
+        q, given = one.q[:, i : i + 1], None
+        if sums is not None:
+            q = one.program.list_drives(start.joints)
+            given = Sums(sums.weights, sums.values[:, i : i + 1])
+        start = engine.solve(one.program, one.e, q, start, sums=given)
+        states.append(start)
+    for i, state in enumerate(states):
+        assert_same(take_rows(chain, [0, 1, 2], [i]), state)
+
+
+def test_a_chain_may_end_at_the_first_pose_that_does_not_converge(engine):
+    one = make_case(zoo.hexapod(), t=3)
+    q = one.q.copy()
+    q[1, 2] = np.nan
+    chain = follow(engine, one.program, one.e, q, one.home, ends=True)
+    whole = follow(engine, one.program, one.e, one.q, one.home)
+    assert_array_equal(chain.status[1], [CONVERGED, CONVERGED, NOT_FINITE, NOT_FINITE, NOT_FINITE])
+    assert_same(take_rows(chain, [0, 2], np.arange(5)), take_rows(whole, [0, 2], np.arange(5)))
+    assert_same(take_rows(chain, [1], [0, 1]), take_rows(whole, [1], [0, 1]))
 
 
 def test_a_task_and_fewer_sums_lead_where_all_sums_do(engine):

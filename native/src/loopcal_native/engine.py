@@ -39,6 +39,9 @@ from loopcal_native.arguments import (
     require_start,
 )
 from loopcal_native.library import (
+    APART,
+    CHAINED,
+    ENDING,
     TASK_FAILED,
     ReachOutput,
     allocate,
@@ -67,6 +70,7 @@ def make_engine(variant: str = "") -> Engine:
     own = NativeFunctions(sets[name])
     functions = own.solve, own.certify, own.reach, own.linearize, own.fold
     functions += own.differentiate, own.fold_poses, own.solve_triangles, own.compare_poses
+    functions += (own.follow,)
     return Engine(f"native:{name}", VERSION, *functions, is_complete=True)
 
 
@@ -87,6 +91,7 @@ class NativeFunctions:
         max_iterations: int = 60,
         goal: State | None = None,
         sums: Sums | None = None,
+        order: int = APART,
     ) -> State:
         """Find the pose and the joints that close every loop."""
         t, n = max(len(e), len(q), len(start.T)), max(q.shape[1], start.T.shape[1])
@@ -120,6 +125,7 @@ class NativeFunctions:
                 t,
                 n,
                 max(max_iterations, 0),
+                order,
                 calls.function if calls else NO_TASK,
                 None,
                 T.ctypes.data,
@@ -132,6 +138,23 @@ class NativeFunctions:
         groups = len(program.groups)
         parts = tuple(out[:groups]), status, residual, iterations, sign, tuple(out[groups:])
         return State(T, *parts)
+
+    def follow(
+        self,
+        program: Program,
+        e: FloatArray,
+        q: FloatArray,
+        start: State,
+        ends: bool = False,
+        max_iterations: int = 60,
+        sums: Sums | None = None,
+    ) -> State:
+        """Solve the poses of each trial one after the other."""
+        order = ENDING if ends else CHAINED
+        q = q if sums is None else program.list_drives(start.joints)
+        return self.solve(
+            program, e, q, start, max_iterations=max_iterations, sums=sums, order=order
+        )
 
     def certify(
         self, program: Program, e: FloatArray, start: State, goal: State

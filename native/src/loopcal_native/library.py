@@ -10,8 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
-ABI = 8
+ABI = 9
 """The C interface that this package calls; dispatch.cpp states it, too."""
+APART, CHAINED, ENDING = 0, 1, 2
+"""Where `loopcal_solve` begins the poses of a trial; interface.h states it, too."""
 NO_MEMORY, TASK_FAILED = 1, 2
 """What functions of the library return, beside 0."""
 MOST_CONDITIONS = 64
@@ -79,7 +81,8 @@ def load_library() -> ctypes.CDLL:
     library.loopcal_fold_poses.argtypes += (*(ADDRESS,) * 3, *(COUNT,) * 2)
     library.loopcal_compare_poses.argtypes = (INT, *(ADDRESS,) * 3, *(COUNT,) * 2)
     library.loopcal_solve_triangles.argtypes = (INT, *(ADDRESS,) * 4, *(COUNT,) * 2)
-    library.loopcal_solve.argtypes = (INT, *(ADDRESS,) * 4, *(COUNT,) * 3, TASK, *(ADDRESS,) * 7)
+    library.loopcal_solve.argtypes = (INT, *(ADDRESS,) * 4, *(COUNT,) * 3)
+    library.loopcal_solve.argtypes += (INT, TASK, *(ADDRESS,) * 7)
     return library
 
 

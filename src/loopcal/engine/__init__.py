@@ -36,6 +36,7 @@ from loopcal.engine.selection import compare_poses as compare_poses
 from loopcal.engine.selection import differentiate as differentiate
 from loopcal.engine.selection import fold as fold
 from loopcal.engine.selection import fold_poses as fold_poses
+from loopcal.engine.selection import follow as follow
 from loopcal.engine.selection import get_current_engine as get_current_engine
 from loopcal.engine.selection import linearize as linearize
 from loopcal.engine.selection import reach as reach

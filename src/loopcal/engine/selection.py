@@ -66,9 +66,10 @@ class Engine:
     """An implementation of the functions whose docstrings are below.
 
     name : as in LOOPCAL_ENGINE, with its variant. version : of the package that computes.
-    solve_triangles, compare_poses : None where the functions of `loopcal.numerics` and of
-        `loopcal.geometry` do it. is_complete : whether programs may have nodes but the platform,
-        and sums of driven joints may be given; NumPy computes these for an engine that is not.
+    solve_triangles, compare_poses, follow : None where the functions of `loopcal.numerics`, of
+        `loopcal.geometry` and `solve` do it. is_complete : whether programs may have nodes but the
+        platform, and sums of driven joints may be given; NumPy computes these for an engine that is
+        not.
     """
 
     name: str
@@ -82,6 +83,7 @@ class Engine:
     fold_poses: Callable[..., tuple[FloatArray, BoolArray]]
     solve_triangles: Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]] | None = None
     compare_poses: Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]] | None = None
+    follow: Callable[..., State] | None = None
     is_complete: bool = False
 
     def __str__(self) -> str:
@@ -196,6 +198,28 @@ def solve(
     own = replace(state, joints=joints)
     sign = current.solve(program.idle_limbs, e, q, own, None, True, 0, None).closure_sign
     return replace(state, closure_sign=state.closure_sign * sign)
+
+
+def follow(
+    program: Program,
+    e: FloatArray,
+    q: FloatArray,
+    start: State,
+    ends: bool = False,
+    max_iterations: int = 60,
+    sums: Sums | None = None,
+) -> State:
+    """Solve the poses of each trial one after the other, each from the solution of the one before.
+
+    Arguments are those of `solve`, start : (t | 1, 1); with `sums`, q is not read. With `ends`, a trial ends at its first pose
+    that does not converge; the others get its status, and no meaning.
+    """
+    own = _get_engine_for(program, sums).follow
+    if own is None or program.idle_groups:
+        from loopcal.engine.numpy_engine.newton import follow_by
+
+        return follow_by(solve, program, e, q, start, ends, max_iterations, sums)
+    return own(program, e, q, start, ends, max_iterations, sums)
 
 
 def certify(program: Program, e: FloatArray, start: State, goal: State) -> NDArray[np.int8]:

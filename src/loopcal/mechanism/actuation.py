@@ -191,6 +191,12 @@ def measure_sums(program: Program, weights: FloatArray) -> FloatArray:
         return (1.0 / (np.abs(weights[0]) / units).max(axis=1)).clip(max=1e12)
 
 
+def scale_sums(program: Program, weights: FloatArray, sums: FloatArray) -> engine.Sums:
+    """Return sums (t | 1, n, r) of driven joints as the engine takes them, in lengths."""
+    units = measure_sums(program, weights)
+    return engine.Sums(weights * units[:, None], sums * units)
+
+
 def solve_open_sums(
     program: Program,
     e: FloatArray,
@@ -203,8 +209,7 @@ def solve_open_sums(
     """Return the states (t, n) at which the weighted sums (t | 1, n, r) of driven joints are given,
     and the conditions of a task, by Newton's method from `begin` (t | 1, n | 1).
     """
-    units = measure_sums(program, weights)
-    own = engine.Sums(weights * units[:, None], sums * units)
+    own = scale_sums(program, weights, sums)
     q = program.list_drives(begin.joints)
     return engine.solve(program, e, q, begin, task, False, max_iterations, sums=own)
 

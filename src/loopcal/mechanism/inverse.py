@@ -739,12 +739,14 @@ DEPENDENT = 1e-9
 
 class _Point(NamedTuple):
     """Iterates of R rows, their differences (R, 6) from the targets in lengths [m], and the sums of
-    their squares (R,) [m^2], infinite where the loops are open.
+    their squares (R,) [m^2], infinite where the loops are open. bent : (R,) whose last step was too
+    long.
     """
 
     now: _Iterate
     gap: FloatArray
     cost: FloatArray
+    bent: BoolArray
 
 
 class _Step(NamedTuple):
@@ -755,6 +757,61 @@ class _Step(NamedTuple):
     drives: FloatArray
     change: FloatArray
     share: FloatArray
+
+
+class _Projection(NamedTuple):
+    """The projection of R rows onto what is reachable, to poses T (R, 4, 4)."""
+
+    rows: _Rows
+    T: FloatArray
+    control: Halving
+
+    def measure(self, now: _Iterate, bent: BoolArray, of: IntArray | slice = slice(None)) -> _Point:
+        """Return iterates of these rows with their differences from the targets."""
+        gap = geometry.pose_difference(now.T, self.T[of]) * self.rows.robot.twist_scale
+        cost = np.where(np.isfinite(now.D).all(axis=(1, 2)), (gap**2).sum(axis=1), np.inf)
+        return _Point(now, gap, cost, bent)
+
+    def propose(self, point: _Point) -> _Step:
+        """Return the Gauss-Newton step of the drives that carry the platform."""
+        rows, robot = self.rows, self.rows.robot
+        slope = point.now.D * robot.twist_scale[:, None] * rows.spans
+        slope = np.where(np.isfinite(point.cost)[:, None, None], slope, 0.0)[..., rows.moving]
+        inverse = np.linalg.pinv(slope, rcond=DEPENDENT)
+        step = np.matmul(inverse, -point.gap[..., None])
+        change, drives = np.matmul(slope, step)[..., 0], np.zeros_like(point.now.u)
+        drives[:, rows.moving] = step[..., 0]
+        drives *= rows.spans
+        length = np.abs(drives * rows.units).max(axis=1, keepdims=True) / robot.size
+        return _Step(drives, (change**2).sum(axis=1), LONGEST_STEP / length.clip(LONGEST_STEP))
+
+    def move(self, point: _Point, step: _Step, share: FloatArray) -> _Point:
+        """Return the points at the longest of the `SHARES` of these shares (R, 1) of a step that
+        does not raise the distance; where none does, a row stays.
+
+        A row whose last step was too long tries all of them at once, any other the first one alone
+        before.
+        """
+        now, left = point.now, np.flatnonzero(share[:, 0])
+        gap, cost, bent = point.gap.copy(), point.cost.copy(), point.bent.copy()
+        first, last = np.zeros(len(bent), int), np.where(bent, len(SHARES), 1)
+        while len(left):
+            row = np.repeat(left, (last - first)[left])
+            tried = np.concatenate([np.arange(first[i], last[i]) for i in left])
+            begin = point.now.take(row)
+            u = begin.u + SHARES[tried, None] * share[row] * step.drives[row]
+            trial = self.measure(self.rows.select(row).place(u, begin.loops), bent, row)
+            lower = np.flatnonzero(~self.control.is_worse(trial.cost, point.cost[row]))
+            best = np.full(len(bent), -1)
+            best[row[lower[::-1]]] = lower[::-1]  # of each row the first one
+            chosen = left[best[left] >= 0]
+            own = best[chosen]
+            now = now.put(chosen, trial.now.take(own))
+            gap[chosen], cost[chosen] = trial.gap[own], trial.cost[own]
+            bent[left], bent[chosen] = True, tried[own] > 0
+            left = left[(best[left] < 0) & (last[left] < len(SHARES))]
+            first, last = np.ones_like(first), np.full_like(last, len(SHARES))
+        return _Point(now, gap, cost, bent)
 
 
 def find_nearest_reachable(
@@ -771,47 +828,14 @@ def find_nearest_reachable(
     first = map_arrays(lambda a: a[0, closed, None], state)
     if not moves_by_drives(robot):
         first = replace(first, closure_sign=compute_closure_sign(robot, values, first))
-    rows, scale = _make_rows(robot, values, wanted[0, closed]), robot.twist_scale
-
-    def measure(now: _Iterate, of: IntArray | slice = slice(None)) -> _Point:
-        gap = geometry.pose_difference(now.T, T[0, closed][of]) * scale
-        cost = np.where(np.isfinite(now.D).all(axis=(1, 2)), (gap**2).sum(axis=1), np.inf)
-        return _Point(now, gap, cost)
-
-    def propose(point: _Point) -> _Step:
-        slope = point.now.D * scale[:, None] * rows.spans
-        slope = np.where(np.isfinite(point.cost)[:, None, None], slope, 0.0)[..., rows.moving]
-        inverse = np.linalg.pinv(slope, rcond=DEPENDENT)
-        step = np.matmul(inverse, -point.gap[..., None])
-        change, drives = np.matmul(slope, step)[..., 0], np.zeros_like(point.now.u)
-        drives[:, rows.moving] = step[..., 0]
-        drives *= rows.spans
-        length = np.abs(drives * rows.units).max(axis=1, keepdims=True) / robot.size
-        return _Step(drives, (change**2).sum(axis=1), LONGEST_STEP / length.clip(LONGEST_STEP))
-
-    def move(point: _Point, step: _Step, share: FloatArray) -> _Point:
-        now, left = point.now, np.flatnonzero(share[:, 0])
-        for shares in (SHARES[:1], SHARES[1:]):
-            if not len(left):
-                break
-            # all shorter lengths at once, of which the first one counts that is no worse
-            tried = np.repeat(left, len(shares))
-            drives = (share[left] * step.drives[left])[:, None] * shares[:, None]
-            begin = point.now.take(tried)
-            new = rows.select(tried).place(begin.u + drives.reshape(begin.u.shape), begin.loops)
-            lower = ~control.is_worse(measure(new, tried).cost, point.cost[tried])
-            lower = lower.reshape(len(left), -1)
-            chosen = np.flatnonzero(lower.any(axis=1))
-            first = chosen * len(shares) + lower.argmax(axis=1)[chosen]
-            now, left = now.put(left[chosen], new.take(first)), np.delete(left, chosen)
-        return measure(now)
-
-    # each step is halved here, all lengths at once
+    rows = _make_rows(robot, values, wanted[0, closed])
+    # each step is halved by `move`
     control = Halving(PROJECTION_STEPS, 1, SHORT_SHARE, SHORT_STEP * robot.size)
-    begin = _begin(rows, first)
-    point, _ = minimize_by_halving(measure(begin), propose, move, control)
+    own, begin = _Projection(rows, T[0, closed], control), _begin(rows, first)
+    origin = own.measure(begin, np.zeros(len(closed), bool))
+    point, _ = minimize_by_halving(origin, own.propose, own.move, control)
     smallest = np.maximum(point.cost, (REACHED * robot.size) ** 2)
-    ended_early = propose(point).change > STATIONARY**2 * smallest
+    ended_early = own.propose(point).change > STATIONARY**2 * smallest
     moved = np.flatnonzero((point.now.u != begin.u).any(axis=1))
     state = replace(state, status=state.status.copy())
     if len(moved):

@@ -17,7 +17,13 @@ from numpy.typing import NDArray
 from loopcal import engine, geometry
 from loopcal.engine import State
 from loopcal.frozen_dataclass import dataclass, replace
-from loopcal.mechanism.actuation import ITERATIONS, DrivenJoints, drive_joints, solve_open_sums
+from loopcal.mechanism.actuation import (
+    ITERATIONS,
+    DrivenJoints,
+    drive_joints,
+    scale_sums,
+    solve_open_sums,
+)
 from loopcal.mechanism.chains import ChainState, each_stage, join_stage_states, locate_stage_bases
 from loopcal.mechanism.limb_rows import follow_limb
 from loopcal.mechanism.model import Mechanism
@@ -45,6 +51,8 @@ from loopcal.typing import BoolArray, FloatArray
 
 PATH_STEPS = (8, 64)
 """Steps of the path from the start's readings, tried in turn where the direct solution fails."""
+PART = 4096
+"""Poses of paths that are solved together."""
 WIDE = 1e-2
 """Gap, relative to the robot's size, that the errors of redundant readings do not explain.
 
@@ -73,10 +81,12 @@ def clear_sign(robot: Mechanism, state: State) -> State:
     return replace(state, closure_sign=np.zeros_like(state.closure_sign))
 
 
-def find_wrong_rows(robot: Mechanism, state: State, begin: State) -> BoolArray:
-    """Return the rows that failed, ended beyond a singularity or left a wide gap."""
+def find_wrong_rows(robot: Mechanism, state: State, sign: NDArray[np.int8]) -> BoolArray:
+    """Return the rows that failed, ended beyond a singularity from rows of these closure signs, or
+    left a wide gap.
+    """
     closed = state.status == Status.CONVERGED.value
-    beyond = (state.closure_sign != begin.closure_sign) | (state.residual > WIDE * robot.size)
+    beyond = (state.closure_sign != sign) | (state.residual > WIDE * robot.size)
     failed = (
         ~closed & (state.status != Status.NOT_FINITE.value) & (state.status != engine.NEAR_GOAL)
     )
@@ -113,6 +123,16 @@ class Loops(NamedTuple):
             state = solve_open_sums(program, e, self.weights, values, begin, max_iterations)
         else:
             state = engine.solve(program, e, values, begin, None, False, max_iterations, goal)
+        return clear_sign(self.robot, state)
+
+    def follow(self, values: FloatArray, begin: State, ends: bool) -> State:
+        """Return states (t, n) at joint values or sums (t, n, a) one after the other, from `begin`
+        (t, 1); see `engine.follow`.
+        """
+        sums = (
+            None if self.weights is None else scale_sums(self.robot.program, self.weights, values)
+        )
+        state = engine.follow(self.robot.program, self.e, values, begin, ends, ITERATIONS, sums)
         return clear_sign(self.robot, state)
 
     def read(self, state: State) -> FloatArray:
@@ -163,7 +183,7 @@ def follow_path(
         leave = count == PATH_STEPS[-1]
         current = _take_steps(loops.select(alive), path, begun, count, leave)
         result = replace_rows(result, alive, zero, current)
-        alive = alive[find_wrong_rows(robot, current, begun)[:, 0]]
+        alive = alive[find_wrong_rows(robot, current, begun.closure_sign)[:, 0]]
         if not len(alive):
             break
     closed = result.status == Status.CONVERGED.value
@@ -183,25 +203,33 @@ def _take_steps(
     With `leave`, a row that fails, opens wide or passes a singularity on the way goes to the end at
     once: the path leaves the reach or the mode of the robot there.
     """
-    (origin, target), moving, done = path, np.arange(len(path[0])), begin
-    all_loops, current = loops, begin
-    for step in range(1, count + 1):
-        q = origin[moving] + (target[moving] - origin[moving]) * (step / count)
-        begun, current = current, loops.solve(q, current)
-        if not leave or step == count:
-            continue
-        wrong = find_wrong_rows(loops.robot, current, begun)[:, 0]
-        wrong |= current.status[:, 0] != Status.CONVERGED.value
+    (origin, target), parts = path, list[State]()
+    shares = np.arange(1, count + 1)[:, None] / count
+    size = max(PART // count, 1)
+    for first in range(0, len(origin), size):
+        rows = np.arange(first, min(first + size, len(origin)))
+        own, start = loops.select(rows, len(origin)), map_arrays(lambda a, r=rows: a[r], begin)
+        values = origin[rows] + (target - origin)[rows] * shares
+        states, last = own.follow(values, start, leave), np.full(len(rows), count - 1)
+        wrong = np.zeros(len(rows), bool)
+        if leave and count > 1:
+            sign = np.concatenate([start.closure_sign, states.closure_sign[:, :-2]], axis=1)
+            before = map_arrays(lambda a: a[:, :-1], states)
+            failed = find_wrong_rows(loops.robot, before, sign)
+            failed |= before.status != Status.CONVERGED.value
+            wrong, last = (
+                failed.any(axis=1),
+                np.where(failed.any(axis=1), failed.argmax(axis=1), last),
+            )
+        done = states.select(states.status.shape, np.arange(len(rows)), last)
         if wrong.any():
-            failed, last = moving[wrong], map_arrays(lambda a, wrong=wrong: a[wrong], current)
-            last = all_loops.select(failed).solve(target[failed], last)
-            done = replace_rows(done, failed, np.zeros_like(failed), last)
-            moving = moving[~wrong]
-            if not len(moving):
-                return done
-            loops = all_loops.select(moving)
-            current = map_arrays(lambda a, wrong=wrong: a[~wrong], current)
-    return replace_rows(done, moving, np.zeros_like(moving), current)
+            left = np.flatnonzero(wrong)
+            end = own.select(left, len(rows)).solve(
+                target[rows[left]], map_arrays(lambda a, r=left: a[r], done)
+            )
+            done = replace_rows(done, left, np.zeros_like(left), end)
+        parts.append(done)
+    return map_arrays(lambda *arrays: np.concatenate(arrays), *parts)
 
 
 def forward_trials(
@@ -267,7 +295,7 @@ def close_at_joints(
         joints, weights = apply_weights(invert_weights(weights), joints), None
     loops = Loops(robot, e, weights)
     state = loops.solve(joints, begin, goal)
-    wrong = find_wrong_rows(robot, state, begin)
+    wrong = find_wrong_rows(robot, state, begin.closure_sign)
     if not wrong.any():
         return state
     if not follow:

@@ -9,8 +9,9 @@ is. Derivation: docs/theory/kinematics.md.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import reduce
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -53,7 +54,7 @@ from loopcal.engine.program import (
     Sums,
     Task,
 )
-from loopcal.frozen_dataclass import dataclass, replace
+from loopcal.frozen_dataclass import dataclass, fields, replace
 from loopcal.typing import BoolArray, FloatArray
 
 # --- Solve closure limb by limb where the platform is given, in closed form.
@@ -221,6 +222,38 @@ def solve(
         chunks.append(_iterate(equations, begin[:, part], max_iterations, goal_rows, together))
     whole = Solved(*(np.concatenate(arrays, axis=-1) for arrays in zip(*chunks, strict=True)))
     return _pack(program, whole, (t, n))
+
+
+def follow_by(
+    solve: Callable[..., State],
+    program: Program,
+    e: FloatArray,
+    q: FloatArray,
+    start: State,
+    ends: bool = False,
+    max_iterations: int = 60,
+    sums: Sums | None = None,
+) -> State:
+    """Solve the poses of each trial one after the other; see `loopcal.engine.follow`."""
+    given, states = sums, list[State]()
+    for i in range(q.shape[1] if sums is None else sums.values.shape[1]):
+        before, own = states[-1] if states else start, q[:, i : i + 1]
+        if sums is not None:
+            given = sums._replace(values=sums.values[:, i : i + 1])
+            own = program.list_drives(before.joints)
+        new = solve(program, e, own, before, None, False, max_iterations, None, given)
+        if states and ends:
+            status = np.where(before.status == CONVERGED, new.status, before.status)
+            new = replace(new, status=status)
+        states.append(new)
+
+    def join(name: str) -> Any:
+        parts = [getattr(state, name) for state in states]
+        if isinstance(parts[0], tuple):
+            return tuple(np.concatenate(own, axis=1) for own in zip(*parts, strict=True))
+        return np.concatenate(parts, axis=1)
+
+    return State(**{f.name: join(f.name) for f in fields(State)})
 
 
 def _iterate(
