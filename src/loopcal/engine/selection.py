@@ -211,8 +211,8 @@ def follow(
 ) -> State:
     """Solve the poses of each trial one after the other, each from the solution of the one before.
 
-    Arguments are those of `solve`, start : (t | 1, 1); with `sums`, q is not read. With `ends`, a trial ends at its first pose
-    that does not converge; the others get its status, and no meaning.
+    Arguments are those of `solve`, start : (t | 1, 1); with `sums`, q is not read. With `ends`, a
+    trial ends at its first pose that does not converge; the others get its status, and no meaning.
     """
     own = _get_engine_for(program, sums).follow
     if own is None or program.idle_groups:
