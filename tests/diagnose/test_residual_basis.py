@@ -36,3 +36,25 @@ def test_graded_columns_of_a_large_fit_have_a_basis():
     v, _ = np.linalg.qr(rng.standard_normal((70, 70)))
     s = np.repeat(10.0 ** -np.arange(0.0, 17.5, 0.5), 2)
     assert span_columns((u * s) @ v.T).shape[1] < 70
+
+
+def test_columns_of_sessions_are_decomposed_on_their_own(monkeypatch):
+    rng = np.random.default_rng(0)
+    columns = np.zeros((240, 40))
+    for i in range(12):  # sessions of 20 rows and three columns, of which one depends on the others
+        own = rng.standard_normal((20, 3))
+        own[:, 2] = own[:, 0] - 2.0 * own[:, 1]
+        columns[20 * i : 20 * (i + 1), 3 * i : 3 * (i + 1)] = own
+    columns[:, 36:39] = rng.standard_normal((240, 3))
+    columns[:, 39] = columns[:, :39] @ rng.standard_normal(39)
+    order = rng.permutation(240), rng.permutation(40)
+    mixed = columns[np.ix_(*order)]
+    whole = np.linalg.svd(mixed, full_matrices=False)[0][:, : 2 * 12 + 3]
+    sizes, decompose = [], np.linalg.svd
+    monkeypatch.setattr(
+        np.linalg, "svd", lambda a, **how: (sizes.append(a.shape), decompose(a, **how))[1]
+    )
+    basis = span_columns(mixed)
+    assert basis.shape == (240, 27)
+    assert np.allclose(basis @ basis.T, whole @ whole.T, atol=1e-10)
+    assert max(map(max, sizes)) <= 4

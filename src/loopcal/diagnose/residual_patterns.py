@@ -34,6 +34,7 @@ from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations
 from loopcal.mechanism.model import Mechanism
 from loopcal.numerics.distributions import beta_probability
+from loopcal.numerics.elimination import find_connected_groups
 from loopcal.numerics.statistics import (
     Remainder,
     VarianceComponent,
@@ -129,9 +130,38 @@ class ResidualRows:
 
 
 def span_columns(columns: FloatArray) -> FloatArray:
-    """Return an orthonormal basis (R, q) of columns (R, c), each scaled to length one."""
+    """Return an orthonormal basis (R, q) of columns (R, c), each scaled to length one.
+
+    Columns without values in common rows, such as those of different sessions, are decomposed on
+    their own, and columns with values in most rows after all others: what is left of them.
+    """
     length = np.linalg.norm(columns, axis=0)
     scaled = columns[:, length > 0.0] / length[length > 0.0]
+    is_used = scaled != 0.0
+    is_wide = 2 * is_used.sum(axis=0) > len(scaled)
+    if is_wide.all():
+        return _decompose_columns(scaled)
+    narrow, wide = scaled[:, ~is_wide], scaled[:, is_wide]
+    row, column = np.nonzero(is_used[:, ~is_wide])
+    first = np.argmax(is_used[:, ~is_wide], axis=1)[row]
+    group = find_connected_groups(np.column_stack([first, column]), narrow.shape[1])
+    of_row = group[np.argmax(is_used[:, ~is_wide], axis=1)]
+    parts = []
+    for number in range(int(group.max()) + 1):
+        rows = np.flatnonzero((of_row == number) & is_used[:, ~is_wide].any(axis=1))
+        own = _decompose_columns(narrow[np.ix_(rows, np.flatnonzero(group == number))])
+        parts.append(np.zeros((len(scaled), own.shape[1])))
+        parts[-1][rows] = own
+    basis = np.concatenate(parts, axis=1)
+    left = wide - basis @ (basis.T @ wide)
+    left -= basis @ (basis.T @ left)  # the first projection leaves rounding
+    size = np.linalg.norm(left, axis=0)
+    left = left[:, size > EXPLAINED] / size[size > EXPLAINED]
+    return np.concatenate([basis, _decompose_columns(left)], axis=1)
+
+
+def _decompose_columns(scaled: FloatArray) -> FloatArray:
+    """Return an orthonormal basis (R, q) of columns (R, c) of length one."""
     if not scaled.size:
         return scaled
     Q, R = np.linalg.qr(scaled)  # the triangle first: LAPACK divides and conquers many rows
@@ -250,6 +280,7 @@ SESSION, BLOCK, POSE, TARGET, WALK = "session", "block", "pose", "target", "walk
 SMOOTH, ROUGH = "smooth", "rough"
 RANDOM = {SESSION, BLOCK, POSE, TARGET, WALK, SMOOTH, ROUGH}  # whose sizes are drawn
 CAUSE = "residuals.cause"  # code of the finding on the cause of residuals
+CHUNK = 32  # columns that are multiplied together
 MOST_POSES = 100  # poses that show an effect well enough, evenly chosen of more
 
 
@@ -520,10 +551,12 @@ def test_correlation(rows: ResidualRows) -> tuple[float, float]:
     LU = np.zeros_like(U)
     LU[pairs] += 0.5 * U[pairs + 1]
     LU[pairs + 1] += 0.5 * U[pairs]
-    inner = U.T @ LU
     # traces of B = M L M, from tr L = 0 and tr L^2 = pairs / 2
-    first = -float(np.trace(inner))
-    second = 0.5 * len(pairs) - 2.0 * float((LU**2).sum()) + float((inner**2).sum())
+    first = -float((U * LU).sum())
+    second = 0.5 * len(pairs) - 2.0 * float((LU**2).sum())
+    for i in range(0, U.shape[1], CHUNK):  # most columns have values in the rows of one session
+        used = LU[:, i : i + CHUNK].any(axis=1)
+        second += float(((U[used].T @ LU[used, i : i + CHUNK]) ** 2).sum())
     mean = first / nu
     variance = 2.0 * (second - first**2 / nu) / (nu * (nu + 2.0))
     if not variance > 0.0:

@@ -228,7 +228,7 @@ def _enter(entries: dict[str, Parameter], parameter: Parameter, owner: str, kind
     name = f"{owner}.{parameter.name}" if owner else parameter.name
     entry = replace(parameter, name=name)
     existing = entries.setdefault(name, entry)
-    if existing != entry:
+    if existing is not entry and existing != entry:
         raise DataError(
             f"the kind {kind.name!r} states the parameter {name!r} as {entry.nominal:.9g} (scope "
             f"{entry.scope}), another kind defines it as {existing.nominal:.9g} (scope "
