@@ -52,7 +52,7 @@ from loopcal.estimate.determinable_setup import (
     report_equal_setup,
     report_fixed_setup,
 )
-from loopcal.estimate.fit_linearization import linearize_fit
+from loopcal.estimate.fit_linearization import FitLinearization, linearize_fit
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.identification import exclude_poses, identify
 from loopcal.estimate.information import count_equations, has_equations_to_spare
@@ -69,6 +69,7 @@ from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import check_instruments
 from loopcal.measure.readings import fill_in_reading_sigma
 from loopcal.mechanism.model import Mechanism
+from loopcal.results.deferred import later
 from loopcal.typing import Progress, StepCounter, report_no_progress
 
 if TYPE_CHECKING:
@@ -86,8 +87,8 @@ NOTHING_TO_COMPARE = (
     "residuals.before-out-of-reach",
 )
 # Steps that the progress callback counts: conventions, model, fit, what the residuals add to the
-# uncertainty, validation, examination, uncertainty budget, suggestions.
-STEPS = 8
+# uncertainty, validation, examination, suggestions.
+STEPS = 7
 # Standard deviations (rms) by which targets on the base contradict each other or their stated
 # places, above which their unit, order or places are wrong: one that was hit moves by less.
 GROSS = 1000.0
@@ -166,19 +167,19 @@ def calibrate(
     held_out = 0 if split.held_out is None else split.held_out.n_poses
     fit, choice, change = _fit(robot, split.fitted, options, count, held_out)
     count.begin("testing the residuals for patterns and slow errors")
-    fit, again, explain = _explain_residuals(fit, split)
+    fit, again, explain, linear = _explain_residuals(fit, split)
     fitting = replace(options, choose_model=False)
     by_region = _fit_by_region(fit, kept, fitting, count) if split.share else None
     if by_region is not None:
         split, plain, change = by_region
         shown = min(f.data["p_value"] for f in fit.findings if f.code == DISCREPANCY)
-        fit, again, explain = _explain_residuals(plain, split, shown)
+        fit, again, explain, linear = _explain_residuals(plain, split, shown)
     if again is not split:
         refit, _, change = _fit(fit.initial, again.fitted, fitting, count, held_out)
         if refit.converged:
-            split, fit = again, adjust_uncertainty(explain(refit), again.fitted)
+            split, fit, linear = again, adjust_uncertainty(explain(refit), again.fitted), None
     outliers = _search_before_split(fit, split, kept, options)
-    return _report(fit, choice, change, split, conventions, options, count, outliers)
+    return _report(fit, choice, change, split, conventions, options, count, outliers, linear)
 
 
 def _fit_by_region(
@@ -196,10 +197,12 @@ def _fit_by_region(
 
 def _explain_residuals(
     fit: Identification, split: DataSplit, slow_p_value: float = 1.0
-) -> tuple[Identification, DataSplit, Callable[[Identification], Identification]]:
+) -> tuple[
+    Identification, DataSplit, Callable[[Identification], Identification], FitLinearization | None
+]:
     """Return the fit with the uncertainty that its residuals show; the data with noise that
-    includes errors of drives or poses where these cause them, else as they are; and how a fit of
-    these data states the causes. `slow_p_value` : see `adjust_uncertainty`.
+    includes errors of drives or poses where these cause them, else as they are; how a fit of these
+    data states the causes; and the linearized fit. `slow_p_value` : see `adjust_uncertainty`.
     """
     linear, drives, explained = None, None, None
     if is_explainable(fit):
@@ -219,7 +222,7 @@ def _explain_residuals(
         refit = replace(refit, findings=(*refit.findings, *findings))
         return refit if drives is None else drives.add_to(refit)
 
-    return fit, split, explain
+    return fit, split, explain, linear
 
 
 def _fit(
@@ -280,15 +283,19 @@ def _report(
     options: CalibrationOptions,
     count: StepCounter,
     outliers: Sequence[Finding],
+    linear: FitLinearization | None,
 ) -> CalibrationReport:
-    """Validate and examine a fit, and return the report."""
+    """Validate and examine a fit, and return the report. `linear` : see `linearize_fit`."""
     fit, fitted, held_out = interpret_fit(fit), split.fitted, split.held_out
     count.begin("predicting the held-out poses" if held_out is not None else "computing errors")
     errors, impossible = _validate(fit, fitted if held_out is None else held_out, options)
     count.begin("examining the residuals")
-    examination = examine_fit(fit, fitted, count.progress, options.frame) if fit.converged else None
-    count.begin("computing the uncertainty budget")
-    budget = compute_error_budget(fit, fitted, options.frame) if fit.converged else None
+    examination, budget, given = None, None, (fit, fitted)
+    if fit.converged:
+        if fit.residual_test.intervals:
+            linear = linearize_fit(*given, linear)
+        examination = examine_fit(*given, count.progress, options.frame, linear)
+        budget = later(lambda: compute_error_budget(*given, options.frame, linear))
     volume, of_volume = _bound_volume(fit, errors if held_out is not None else None, options)
     count.begin("looking for further measurements")
     suggestions = None

@@ -35,6 +35,7 @@ from loopcal.frozen_dataclass import dataclass
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import InstrumentRecord, list_instruments
 from loopcal.mechanism.model import Mechanism
+from loopcal.results.deferred import DeferredFields, deferred
 from loopcal.results.description import Field, Records, fields
 from loopcal.results.result import TableResult
 from loopcal.results.serialization import json_fields, to_json
@@ -81,8 +82,8 @@ def _count_fitted_poses(fit: Identification, data: Measurements) -> int:
 
 
 @dataclass(frozen=True, eq=False)
-class CalibrationReport(TableResult):
-    """The result of `calibrate`.
+class CalibrationReport(DeferredFields, TableResult):
+    """The result of `calibrate`. Its budget is computed when it is first asked for.
 
     Attributes
     ----------
@@ -119,7 +120,6 @@ class CalibrationReport(TableResult):
     fitted_errors: Validation | None
     height_errors: HeightErrors | None
     findings: tuple[Finding, ...]
-    budget: ErrorBudget | None
     examination: FitExamination | None
     suggestions: tuple[MeasurementSuggestion, ...] | None
     reading_errors: tuple[ReadingError, ...] | None
@@ -128,6 +128,7 @@ class CalibrationReport(TableResult):
     comparison: ValueComparison | None
     volume: VolumeAccuracy | None
     provenance: Provenance
+    budget: ErrorBudget | None = deferred()
 
     FIELDS: ClassVar[tuple[Field, ...]] = (
         *fields("verdict", "headline", "states_expected_error", "findings", "recommendation"),

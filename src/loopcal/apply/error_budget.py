@@ -580,17 +580,20 @@ class ErrorBudget(DrawnResult):
 
 
 def compute_error_budget(
-    fit: Identification, data: Measurements, frame: str = FITTED
+    fit: Identification,
+    data: Measurements,
+    frame: str = FITTED,
+    linear: FitLinearization | None = None,
 ) -> ErrorBudget | None:
     """Return the uncertainty budget of a calibrated machine; None where the fit has no intervals,
     or where no pose is reached.
 
     frame : in which the errors of poses are stated, see `choose_error_frame`; "relative" means
-        relative to the home pose.
+        relative to the home pose. linear : the linearized fit, see `linearize_fit`.
     """
     if not (fit.converged and fit.residual_test.intervals):
         return None
-    linear = linearize_fit(fit, data)
+    linear = linearize_fit(fit, data, linear)
     is_workspace = True
     try:
         drawn = sample_workspace(fit.robot, POSES, SEED).solution

@@ -23,7 +23,7 @@ from loopcal.diagnose.outliers import OutlierCheck, find_outliers
 from loopcal.diagnose.residual_patterns import CAUSE
 from loopcal.diagnose.value_comparison import compare_with_truth
 from loopcal.errors import EstimationError
-from loopcal.estimate.fit_linearization import linearize_fit
+from loopcal.estimate.fit_linearization import FitLinearization, linearize_fit
 from loopcal.estimate.identification import identify
 from loopcal.estimate.penalties import LeastSquares
 from loopcal.estimate.residual_test import FEWEST_DEGREES, SIGNIFICANCE
@@ -207,6 +207,7 @@ def examine_fit(
     data: Measurements,
     progress: Progress = report_no_progress,
     frame: str = FITTED,
+    linear: FitLinearization | None = None,
 ) -> FitExamination:
     """Examine a fit with the data it was made from.
 
@@ -216,12 +217,12 @@ def examine_fit(
     progress : receives the rounds of the search for outliers, which takes longest, and that the
         other tests begin.
     frame : in which expected errors are stated, see `choose_error_frame`.
+    linear : the linearized fit, see `linearize_fit`.
     """
     outliers, causes = find_outliers(fit, data, progress=progress), ()
     progress(0, 1, "testing for heavy tails")
-    linear = None
     if fit.converged and fit.residual_test.intervals:
-        linear = linearize_fit(fit, data)
+        linear = linearize_fit(fit, data, linear)
     known = [f for f in fit.findings if f.code == CAUSE]
     if outliers.suspects and not known and linear is not None:
         explained = explain_residuals(linear, is_doubted=True)

@@ -37,7 +37,12 @@ from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import read_coordinates
 from loopcal.mechanism.solutions import Solution, inverse, make_solution
 from loopcal.numerics.distributions import student_probability
-from loopcal.numerics.statistics import NEAR_ONE, compute_chi_square_tail, invert_increasing
+from loopcal.numerics.statistics import (
+    NEAR_ONE,
+    compute_chi_square_quantile,
+    compute_chi_square_tail,
+    invert_increasing,
+)
 from loopcal.numerics.trial_batch import map_arrays
 from loopcal.parameters import ParameterTable
 from loopcal.typing import BoolArray, FloatArray, IntArray
@@ -66,13 +71,19 @@ def _median_of_largest(variances: FloatArray) -> float:
     if not len(mean):
         return float("nan")
     degrees, unit = mean**2 / square, square / mean
+    # if all errors were like one of them, the largest would be below its limit half of the time
+    exceeded = -np.expm1(np.log(0.5) / len(mean))
+    limits = unit * compute_chi_square_quantile(degrees, exceeded)
+    lowest = float(limits.min())
 
-    def compute_log_probability(limit: float) -> float:
-        tail = compute_chi_square_tail(degrees, limit / unit)
+    def compute_log_probability(above: float) -> float:
+        tail = compute_chi_square_tail(degrees, (lowest + above) / unit)
         return float(np.log1p(-np.minimum(tail, NEAR_ONE)).sum())
 
-    highest = 1e3 * float(mean.max())
-    return float(np.sqrt(invert_increasing(compute_log_probability, np.log(0.5), highest, 60)))
+    width = float(limits.max()) - lowest
+    if width > 1e-12 * lowest:
+        lowest += invert_increasing(compute_log_probability, np.log(0.5), width, 50)
+    return float(np.sqrt(lowest))
 
 
 # All numbers that results, JSON and tables state of errors, by their names there.

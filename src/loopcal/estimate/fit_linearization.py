@@ -106,13 +106,13 @@ def linearize_fit(
 
     data : the measurements it was made from.
     linear : the result for the same fit before findings widened its covariance, which is used
-        again.
+        again; anew where another test of the residuals scales the noise since.
 
     Raises
     ------
     DataError : the measurements have another number of poses than the fit.
     """
-    if linear is not None:
+    if linear is not None and fit.residual_test is linear.fit.residual_test:
         return linear._replace(fit=fit)
     data = prepare_fitted_data(fit, data)
     problem, solution, linearization = linearize_at_estimate(fit, data)
