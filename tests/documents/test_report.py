@@ -104,7 +104,7 @@ def test_identifiers_are_unique_and_references_lead_somewhere(page) -> None:
 def test_pictures_have_descriptions_and_tables_have_scopes(page) -> None:
     text = page.read_text("utf-8")
     pictures = re.findall(r"<figure[^>]*>\s*(?:<script.*?</script>\s*)?(<svg.*?</svg>)", text, re.S)
-    names = ("validation", "scene", "accuracy", "parameter", "correlation", "residual")
+    names = ("validation", "scene", "accuracy", "budget", "parameter", "correlation", "residual")
     for name, picture in zip(names, pictures, strict=True):
         assert f'role="img" aria-labelledby="{name}-figure-description"' in picture
         assert "<text" in picture  # text, not outlines

@@ -23,6 +23,7 @@ from loopcal.report.figures.fit_figures import (
 )
 from loopcal.report.figures.result_figures import (
     draw_accuracy_map,
+    draw_budget_sources,
     draw_height_errors,
     draw_validation,
 )
@@ -168,6 +169,20 @@ def draw_height_picture(record: CalibrationRecord) -> Iterator[Element]:
         "predicted minus measured, with the same scale before and after calibration. Circles were "
         "used in the fit, squares were held out.",
     )
+
+
+@report_figure("budget")
+def draw_budget_picture(record: CalibrationRecord) -> Iterator[Element]:
+    """Yield the sources of the expected error as bars."""
+    budget = record.result.get("expected_error")
+    if budget and budget.get("sources"):
+        yield make_picture(
+            partial(draw_budget_sources, budget),
+            "budget-figure",
+            "Expected error by source.",
+            "A bar is the part of a source in the root mean square error; a diamond is the error "
+            "of all sources if the sigma of this one were half as large.",
+        )
 
 
 @report_figure("workspace")

@@ -46,7 +46,7 @@ from loopcal.report.figures.style import (
 )
 from loopcal.report.validation_view import WORDS
 from loopcal.results.presenters import register
-from loopcal.results.tables import format_uncertainty, format_with_uncertainty
+from loopcal.results.tables import choose_unit, format_uncertainty, format_with_uncertainty
 from loopcal.typing import FloatArray, IntArray
 from loopcal.units import Dimension, Unit
 
@@ -161,7 +161,8 @@ def draw_residual_rows(
     heights = [*[2.2] * len(groups), 2.6, *[2.3] * rows]
     grid = figure.add_gridspec(len(heights), 2 * COLUMNS, height_ratios=heights)
     for i, group in enumerate(groups.values()):
-        unit = robot.get_unit(group[0].dimension)
+        raw = np.concatenate([s.raw for s in group])
+        unit = choose_unit(robot.get_unit(group[0].dimension), raw)
         _draw_by_pose(figure.add_subplot(grid[i, :]), unit, poses, group, styles)
     n = len(groups)
     _draw_components(figure.add_subplot(grid[n, :2]), series, styles)

@@ -3,14 +3,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from loopcal.apply.accuracy import AccuracyMap
 from loopcal.apply.conformity import Conformity
-from loopcal.apply.error_budget import ErrorBudget
+from loopcal.apply.error_budget import LENGTHS, ErrorBudget
 from loopcal.apply.height_errors import HeightErrors
 from loopcal.apply.repeatability import DIMENSIONS, Estimate, Repeatability, VisitedPose
 from loopcal.apply.run_comparison import RunComparison
@@ -46,9 +46,10 @@ from loopcal.report.figures.style import (
     start_panels,
 )
 from loopcal.results.presenters import register
+from loopcal.results.serialization import json_fields
 from loopcal.results.tables import choose_unit, format_number
 from loopcal.typing import BoolArray, FloatArray
-from loopcal.units import DISPLAY_UNITS, Dimension, Unit
+from loopcal.units import DISPLAY_UNITS, Unit
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -105,28 +106,32 @@ def _draw_visits(
 
 @register("figure", ErrorBudget)
 def draw_budget(budget: ErrorBudget) -> Figure:
+    """Draw the sources of a budget, see `draw_budget_sources`."""
+    return draw_budget_sources(json_fields(budget))
+
+
+def draw_budget_sources(budget: Mapping[str, Any]) -> Figure:
     """Draw the part of each source in the expected error of poses as bars, and the error that half
-    the sigma of a source would leave.
+    the sigma of a source would leave; budget : content of JSON.
     """
-    lines = budget.lines
-    kinds = [("position", DISPLAY_UNITS[Dimension.LENGTH])]
-    if budget.orientation.rms > ROUNDING:
-        kinds.append(("orientation", DISPLAY_UNITS[Dimension.ANGLE]))
+    lines = budget["sources"]
+    kinds = ["position", *["orientation"] * (budget["orientation"]["rms"] > ROUNDING)]
     width, height = 4.8 * len(kinds) + 1.5, 1.9 + 0.38 * len(lines)
     figure, (panels,) = start_panels(width, height, 1, len(kinds), sharey=True)
-    for axes, (kind, unit) in zip(panels, kinds, strict=True):
-        rms_by_source = np.sqrt([getattr(line, kind) for line in lines]) / unit.factor_to_si
-        total = getattr(budget, kind).rms / unit.factor_to_si
+    for axes, kind in zip(panels, kinds, strict=True):
+        unit = choose_unit(DISPLAY_UNITS[LENGTHS[kind]], [budget[kind]["rms"]])
+        rms_by_source = np.sqrt([line[kind] for line in lines]) / unit.factor_to_si
+        total = budget[kind]["rms"] / unit.factor_to_si
         axes.barh(np.arange(len(lines)), rms_by_source, height=0.6, color=COLORS[5])
         axes.axvline(total, color=DARK, lw=LINE)
         for i, line in enumerate(lines):
-            if line.halved is not None:
-                left = getattr(line.halved, kind) / unit.factor_to_si
+            if line["halved"] is not None:
+                left = line["halved"][f"{kind}_rms"] / unit.factor_to_si
                 axes.plot([left], [i], "D", color=COLORS[1], ms=DOT + 1.0)
         axes.set_xlim(0.0, 1.08 * max(total, rms_by_source.max(initial=0.0)))
         title = f"{kind}: {format_number(total, 3)} {unit.symbol} in all"
         label_axes(axes, f"{kind} [{unit.symbol}]", "", title)
-    label_rows(panels[0], [shorten(line.source.words, 34) for line in lines])
+    label_rows(panels[0], [shorten(line["words"], 34) for line in lines])
     halved = {"color": COLORS[1], "marker": "D", "ms": DOT, "ls": "none"}
     handles = [
         make_patch("part of the source (squares add up)", COLORS[5]),
@@ -134,8 +139,8 @@ def draw_budget(budget: ErrorBudget) -> Figure:
         make_handle("all, with half its sigma", **halved),
     ]
     add_legend(figure, handles)
-    over = "poses of the workspace" if budget.is_workspace else "measured poses"
-    return finish_figure(figure, f"Expected error (rms, k = 1) at {budget.poses} {over}")
+    over = "poses of the workspace" if budget["over"] == "workspace" else "measured poses"
+    return finish_figure(figure, f"Expected error (rms, k = 1) at {budget['poses']} {over}")
 
 
 # Uncertainty of poses over the workspace, in slices, beside the measured poses.
@@ -161,9 +166,12 @@ def draw_accuracy_map(accuracy: AccuracyMap) -> Figure:
     angles = [i for i, name in enumerate(names) if name not in POSITION]
     order = [*lengths, *angles] if len(lengths) > 1 else [*angles, *lengths]
     slices = _cut(accuracy, measured, order[2] if len(order) > 2 else None)
-    quantities = [("position", DISPLAY_UNITS[Dimension.LENGTH])]
-    if np.nanmax(accuracy.uncertainty.orientation, initial=0.0) > NEGLIGIBLE:
-        quantities.append(("orientation", DISPLAY_UNITS[Dimension.ANGLE]))
+    quantities = [
+        (name, choose_unit(DISPLAY_UNITS[LENGTHS[name]], getattr(accuracy.uncertainty, name)))
+        for name in LENGTHS
+        if name == "position"
+        or np.nanmax(accuracy.uncertainty.orientation, initial=0.0) > NEGLIGIBLE
+    ]
     width, height = 1.8 + 3.5 * len(slices), 1.5 + 3.1 * len(quantities)
     figure, grid = start_panels(width, height, len(quantities), len(slices))
     for panels, (name, unit) in zip(grid, quantities, strict=True):
