@@ -613,12 +613,12 @@ def _make_rows(robot: Mechanism, values: FloatArray, target: FloatArray) -> _Row
         np.zeros(len(target)),
         _place_serial_joints(stages, e),
         np.where(turns, robot.size, 1.0),
-        _measure_spans(robot, np.array(turns)),
+        measure_spans(robot, np.array(turns)),
         find_carrying_actuators(robot),
     )
 
 
-def _measure_spans(robot: Mechanism, turns: BoolArray) -> FloatArray:
+def measure_spans(robot: Mechanism, turns: BoolArray) -> FloatArray:
     """Return the `spans` of the drives (u,) of a robot."""
     spans = np.where(turns, 2 * np.pi, robot.size)
     if has_spare_drives(robot):

@@ -90,7 +90,7 @@ def compute_angle(length: FloatArray, triangle: FloatArray) -> FloatArray:
     """Return the joint angle [rad] at a length (..) [m] of triangles (.., 10), NaN where none
     reaches it.
     """
-    level, reach, gamma = _describe(triangle)
+    level, reach, gamma = describe_triangle(triangle)
     side, middle = triangle[..., 8], triangle[..., 9]
     with np.errstate(invalid="ignore"):
         square = np.where(length < 0.0, np.nan, length * length)
@@ -100,13 +100,13 @@ def compute_angle(length: FloatArray, triangle: FloatArray) -> FloatArray:
 
 def compute_length(angle: FloatArray, triangle: FloatArray) -> FloatArray:
     """Return the length of the actuator [m] at joint angles (..) [rad] of triangles (.., 10)."""
-    level, reach, gamma = _describe(triangle)
+    level, reach, gamma = describe_triangle(triangle)
     return np.sqrt(level - reach * np.cos(angle - gamma))
 
 
 def compute_range(triangle: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the lengths [m] at the dead points of triangles (.., 10): the least, the largest."""
-    level, reach, _ = _describe(triangle)
+    level, reach, _ = describe_triangle(triangle)
     return np.sqrt(np.maximum(level - reach, 0.0)), np.sqrt(level + reach)
 
 
@@ -114,7 +114,7 @@ def find_side(start: float, triangle: FloatArray) -> tuple[float, float]:
     """Return sin(theta - gamma) at a start angle [rad], and the middle of its side [rad], of a
     triangle.
     """
-    _, _, gamma = _describe(triangle)
+    _, _, gamma = describe_triangle(triangle)
     lead = geometry.wrap_angle(start - gamma)
     sine = float(np.sin(lead))
     return sine, float(start - lead + np.sign(sine) * np.pi / 2)
@@ -148,7 +148,7 @@ def differentiate_length(angle: FloatArray, triangle: FloatArray) -> tuple[Float
     return arm, np.concatenate(slopes, axis=-1)
 
 
-def _describe(triangle: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def describe_triangle(triangle: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return a, b and gamma of l^2 = a - b cos(theta - gamma) for triangles (.., 10)."""
     tilt = np.swapaxes(geometry.exp_so3(_pad(triangle[..., 6:8])), -1, -2)
     u, v = _apply(tilt, triangle[..., 0:3]), _apply(tilt, triangle[..., 3:6])
@@ -239,7 +239,7 @@ def weigh_points(readings: FloatArray, constants: FloatArray, derivative: int = 
     points = constants[FIXED:][np.isfinite(constants[FIXED:])]
     weights = np.zeros((*readings.shape, len(constants) - FIXED))
     if len(points):
-        spline = _make_spline(points.tobytes(), bool(constants[1]))
+        spline = make_spline(points.tobytes(), bool(constants[1]))
         inside = np.clip(readings, points[0], points[-1])
         inside = np.where(np.isfinite(readings), inside, points[0])
         slope = spline(inside, 1)
@@ -249,7 +249,7 @@ def weigh_points(readings: FloatArray, constants: FloatArray, derivative: int = 
 
 
 @lru_cache
-def _make_spline(points: bytes, is_cubic: bool) -> PPoly:
+def make_spline(points: bytes, is_cubic: bool) -> PPoly:
     """Return the weights of the values at points as functions of the reading: broken lines, or
     natural cubic splines.
     """
@@ -619,7 +619,7 @@ def find_reversed(joints: FloatArray, tau: FloatArray, triangles: IntArray) -> B
     their readings do not lead to.
     """
     triangle = _select_triangles(tau, triangles)
-    _, _, gamma = _describe(triangle)
+    _, _, gamma = describe_triangle(triangle)
     return np.sin(joints[..., triangles] - gamma) * triangle[..., 8] < 0.0
 
 

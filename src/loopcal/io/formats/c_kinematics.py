@@ -1,0 +1,344 @@
+# SPDX-License-Identifier: Apache-2.0
+"""C99 kinematics of an identified robot, for a controller that computes with the complete model.
+
+The tables are the engine's `Program` with links, rods and transmissions at the robot's values; the
+algorithm in `kinematics.c` beside this file is the same for every robot. It closes all loops at
+once by Newton's method, without allocation and with a bounded number of steps, from the last state.
+Derivation: docs/theory/kinematics.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from importlib.resources import files
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from loopcal.engine.numpy_engine.closure import place_links
+from loopcal.engine.program import BASE
+from loopcal.errors import DataError
+from loopcal.findings import report_finding
+from loopcal.io.formats.program_format import Exported, ExportSource, Format
+from loopcal.mechanism.chains import list_carrying_stages
+from loopcal.mechanism.inverse import determine_platform, measure_spans, moves_by_drives
+from loopcal.mechanism.model import Mechanism, Stage
+from loopcal.mechanism.platform_coordinates import EULER, POSITION, TILT
+from loopcal.mechanism.solutions import jacobian
+from loopcal.mechanism.transmission import (
+    ALL_TERMS,
+    FIXED,
+    HARMONICS,
+    REFERENCE,
+    SOURCE,
+    TERMS,
+    describe_triangle,
+    evaluate_references,
+    find_triangles,
+    make_spline,
+    select_table,
+    select_weights,
+)
+from loopcal.mechanism.workspace import sample_workspace
+from loopcal.typing import BoolArray, FloatArray
+from loopcal.units import SI_SYMBOLS
+from loopcal.version import __version__
+
+COORDINATES = (*POSITION, *TILT, *EULER)
+"""Platform coordinates in the order of the C file."""
+SHAPES = ("offset", "gain", "curve", *HARMONICS)
+"""Terms of a transmission in the order of the C file."""
+TESTS, SEED = 50, 0
+"""Poses of the test table, and the seed that draws them from the workspace."""
+AGREEMENT = 1e-12
+"""Largest difference of poses [m, 1] that the test in the file accepts, for a robot of a meter or
+less: it is the rounding of some hundred operations, times the amplification of the mechanism."""
+
+
+class _Joint(NamedTuple):
+    """A joint of a limb: its drive, -1 for none, and its value at home [m, rad]."""
+
+    drive: int
+    is_passive: bool
+    turns: bool
+    pitch: float
+    home: float
+
+
+class _Limb(NamedTuple):
+    """`struct limb` of the C file."""
+
+    ending: str
+    on: int
+    to: int
+    joints: int
+    link: int
+    joint: int
+    rows: int
+    row: list[int]
+    driven: int
+    is_alone: bool
+    length: float
+    sigma: float
+
+
+class _Transmission(NamedTuple):
+    """`struct transmission` of the C file."""
+
+    term: list[float]
+    frequency: float
+    fixed: float
+    begin: float
+    triangle: list[float]
+    reading: int
+    piece: int
+    pieces: int
+
+
+class _Tables(NamedTuple):
+    """Tables of all stages, one after the other. weights : of the drives of a stage, and the first
+    of these.
+    """
+
+    links: list[list[float]]
+    joints: list[_Joint]
+    limbs: list[_Limb]
+    bodies: list[list[float]]
+    moves: list[list[bool]]
+    sums: list[_Transmission]
+    weights: list[tuple[int, FloatArray]]
+    pieces: list[list[float]]
+    stages: list[list[Any]]
+
+
+def write(source: ExportSource, into: Path | None) -> Exported:
+    """Return the C file of a robot at its present conditions.
+
+    DataError : the robot has more drives than freedoms, in limbs with passive joints.
+    """
+    del into
+    robot = source.robot
+    commanded = np.array([a.reference is None for a in robot.actuators])
+    head, body = _write_tables(robot, commanded)
+    text = files("loopcal.io.formats").joinpath("kinematics.c").read_text("utf-8")
+    for mark, part in (("HEAD", head), ("TABLES", body), ("TESTS", _write_tests(robot, commanded))):
+        text = text.replace(f"/* {mark} */", part)
+    return Exported(text, ())
+
+
+def _write_tables(robot: Mechanism, commanded: BoolArray) -> tuple[str, str]:
+    """Return the public constants and the tables."""
+    tables, drives, carrying = _Tables([], [], [], [], [], [], [], [], []), 0, set[int]()
+    carrying.update(list_carrying_stages(robot))
+    reading = np.where(commanded, np.cumsum(commanded) - 1, -1)
+    for i, stage in enumerate(robot.blocks):
+        mount = _flatten(stage.mount)
+        tables.stages.append([stage.parent, len(tables.bodies), i in carrying, mount])
+        e, tau = stage.robot.slots(robot.values[None, stage.parameters])
+        _add_limbs(tables, stage.robot, e, drives)
+        _add_transmissions(tables, stage, tau, reading[stage.actuators].tolist(), drives)
+        drives += stage.robot.program.n_joints
+    weights = np.zeros((len(tables.sums), drives))
+    for row, (first, own) in zip(weights, tables.weights, strict=True):
+        row[first : first + len(own)] = own
+    joints = tables.joints
+    of_drive = [next(i for i, j in enumerate(joints) if j.drive == d) for d in range(drives)]
+    names = robot.controlled
+    is_given = len(robot.blocks) == 1 and determine_platform(robot) and not moves_by_drives(robot)
+    closure, fixed = (
+        sum(limb.rows for limb in tables.limbs),
+        sum(s.reading < 0 for s in tables.sums),
+    )
+    unknown = np.sum(tables.moves) + sum(joint.is_passive for joint in joints) + drives
+    has_spare = not is_given and closure + fixed + len(names) < unknown
+    programs = [stage.robot.program for stage in robot.blocks]
+    spans = np.ones(drives)
+    if has_spare:
+        spans = measure_spans(robot, np.array([joints[i].turns for i in of_drive]))
+    head = {
+        "READINGS": commanded.sum(),
+        "COORDINATES": len(names),
+        "BODIES": len(tables.bodies),
+        "JOINTS": len(joints),
+    }
+    constants = {
+        "STAGES": len(tables.stages),
+        "LIMBS": len(tables.limbs),
+        "DRIVES": drives,
+        "SUMS": len(tables.sums),
+        "CLOSURE_ROWS": closure,
+        "MOST_JOINTS": max(limb.joints for limb in tables.limbs),
+        "PIECES": len(tables.pieces),
+        "TRIANGLES": any(any(s.triangle) for s in tables.sums),
+        "HAS_SUMS": any(stage.robot.has_sums for stage in robot.blocks),
+        "HAS_SPARE_DRIVES": has_spare,
+        "MAY_STAY_OPEN": any(p.may_stay_open or p.sigma is not None for p in programs),
+        "PLATFORM_IS_GIVEN": is_given,
+        "PLACE_OF_PHI": names.index("phi") if "phi" in names else 0,
+        "PLACE_OF_THETA": names.index("theta") if "theta" in names else 0,
+        "SIZE": robot.size,
+    }
+    home = [tables.bodies, [joint.home for joint in joints], 0, 0]
+    parts = [
+        *(f"#define {name} {_write(value)}" for name, value in constants.items()),
+        _table("int COORDINATE[KINEMATICS_COORDINATES]", map(COORDINATES.index, names)),
+        _table(f"double LINK[{len(tables.links)}][12]", tables.links),
+        _table("struct limb LIMB[LIMBS]", tables.limbs),
+        _table("int MOVES[BODIES][6]", tables.moves),
+        _table("int DRIVE[JOINTS]", (joint.drive for joint in joints)),
+        _table("int PASSIVE[JOINTS]", (joint.is_passive for joint in joints)),
+        _table("int TURNS[JOINTS]", (joint.turns for joint in joints)),
+        _table("double PITCH[JOINTS]", (joint.pitch for joint in joints)),
+        _table("int JOINT_OF_DRIVE[DRIVES]", of_drive),
+        _table("double SPAN[DRIVES]", spans),
+        _table("double WEIGHT[SUMS][DRIVES]", weights),
+        _table("struct transmission TRANSMISSION[SUMS]", tables.sums),
+        _table("struct stage STAGE[STAGES]", tables.stages),
+        _table("kinematics_state HOME", home),
+    ]
+    if tables.pieces:
+        parts.append(_table("double PIECE[PIECES][6]", tables.pieces))
+    lines = [*_describe(robot, commanded), ""]
+    lines += [f"#define KINEMATICS_{name} {_write(value)}" for name, value in head.items()]
+    return "\n".join(lines), "\n".join(parts)
+
+
+def _describe(robot: Mechanism, commanded: BoolArray) -> list[str]:
+    """Return the comment at the head of the file."""
+    units = [SI_SYMBOLS[actuator.dimension] for actuator in robot.actuators]
+    names = [f"{a.name} [{unit}]" for a, unit in zip(robot.actuators, units, strict=True)]
+    at = [
+        f"{a.name} = {a.reference:g} {unit}"
+        for a, unit in zip(robot.actuators, units, strict=True)
+        if a.reference is not None
+    ]
+    read = [name for name, is_read in zip(names, commanded, strict=True) if is_read]
+    lines = [
+        f"Kinematics of {robot.name}, written by loopcal {__version__}.",
+        f"Readings: {', '.join(read)}.",
+        f"Coordinates: {', '.join(robot.controlled)}.",
+        *([f"It holds at {', '.join(at)}."] if at else []),
+    ]
+    safe = [line.replace("*/", "* /").replace("/*", "/ *") for line in lines]
+    return ["/* " + "\n * ".join(safe) + " */"]
+
+
+def _write(value: Any) -> str:
+    """Return a value as a C initializer; numbers read back as the same doubles."""
+    if isinstance(value, str):
+        return value
+    if isinstance(value, (bool, np.bool_, int, np.integer)):
+        return str(int(value))
+    if isinstance(value, (float, np.floating)):
+        text = repr(float(value) + 0.0)  # without a negative zero
+        return text if "." in text or "e" in text else f"{text}.0"
+    return "{" + ", ".join(map(_write, value)) + "}"
+
+
+def _table(declaration: str, rows: Iterable[Any]) -> str:
+    """Return a constant table, a line for each row of more than one number."""
+    rows = list(rows)
+    if not rows or isinstance(rows[0], (bool, int, float, np.number, np.bool_)):
+        return f"static const {declaration} = {_write(rows)};"
+    lines = "".join(f"    {_write(row)},\n" for row in rows)
+    return f"static const {declaration} = {{\n{lines}}};"
+
+
+def _flatten(T: FloatArray) -> list[float]:
+    """Return a pose (4, 4) as its rotation by rows, then its position."""
+    return [*T[:3, :3].ravel().tolist(), *T[:3, 3].tolist()]
+
+
+def _add_limbs(tables: _Tables, robot: Mechanism, e: FloatArray, drives: int) -> None:
+    """Add bodies and limbs of a stage with displacements e (1, d); `drives` are those before."""
+    program, home, first = robot.program, robot.home_state, len(tables.bodies)
+    tables.bodies.extend(_flatten(T[0, 0]) for T in (home.T, *home.others))
+    tables.moves.extend([f in freedoms for f in range(6)] for freedoms in program.nodes)
+    for group, joints in zip(program.groups, home.joints, strict=True):
+        placed, count = place_links(group, e), len(group.joints)
+        passive, driven = group.unknown_joints(free=False), group.driven_joints
+        if program.sigma is not None and (passive or len(group.rows) > 1 or len(driven) != 1):
+            raise DataError(report_finding("files.c-redundant", robot=robot.name))
+        # a ball has positions only
+        row = [r + (3 if group.ending == "ball" else 0) for r in group.rows]
+        for k in range(len(group.limbs)):
+            link, joint = len(tables.links), len(tables.joints)
+            for j in range(count + 2):
+                rotation = placed.rotation[j][..., min(k, placed.rotation.shape[3] - 1), 0]
+                tables.links.append([*rotation.ravel().tolist(), *placed.origin[j, :, k, 0]])
+            for j, letter in enumerate(f"{group.joints}P"):
+                actuator = int(group.actuator[j, k])
+                drive = -1 if actuator < 0 else drives + actuator
+                pitch = float(placed.pitch[j, k, 0]) if j < count else 0.0
+                value = float(joints[0, 0, k, j])
+                tables.joints.append(_Joint(drive, j in passive, letter == "R", pitch, value))
+            on, to = (i if i == BASE else first + i for i in (group.on[k], group.to[k]))
+            sigma = 0.0 if program.sigma is None else program.sigma[group.actuator[driven[0], k]]
+            head = (group.ending.upper(), on, to, count, link, joint, len(row))
+            rows, length = [*row, *[0] * (6 - len(row))], float(placed.length[k, 0])
+            last = (driven[0] if driven else 0, robot.is_serial, length, sigma)
+            tables.limbs.append(_Limb(*head, rows, *last))
+
+
+def _add_transmissions(
+    tables: _Tables, stage: Stage, tau: FloatArray, readings: list[int], drives: int
+) -> None:
+    """Add the rows of a stage with terms tau (1, a, k), and where its readings are, -1 for those
+    that are never commanded.
+    """
+    constants = stage.robot.slots.constants
+    references = evaluate_references(tau, constants)[0, 0]
+    triangles, weights = find_triangles(tau), select_weights(tau, constants)
+    for a, row in enumerate(constants):
+        source, points = int(row[SOURCE]), row[FIXED:][np.isfinite(row[FIXED:])]
+        is_fixed = source < 0 or bool(np.isfinite(row[REFERENCE]))
+        pieces: list[list[float]] = []
+        if len(points):
+            own = select_table(tau, constants)[0, a, : len(points)]
+            c = make_spline(points.tobytes(), bool(row[1])).c @ own  # (powers, pieces)
+            c = np.concatenate([np.zeros((4 - len(c), c.shape[1])), c])
+            ends = zip(points[:-1].tolist(), points[1:].tolist(), c.T.tolist(), strict=True)
+            pieces = [[low, high, *powers] for low, high, powers in ends]
+        triangle = [0.0] * 5
+        if a in triangles:
+            terms = tau[0, a, len(TERMS) : len(ALL_TERMS)]
+            triangle = [*map(float, describe_triangle(terms)), *terms[-2:].tolist()]
+        tables.sums.append(
+            _Transmission(
+                [float(tau[0, a, TERMS.index(name)]) for name in SHAPES],
+                float(row[0]),
+                float(references[a]) if is_fixed else 0.0,
+                float(points.mean()) if len(points) else 0.0,
+                triangle,
+                -1 if is_fixed else readings[source],
+                len(tables.pieces),
+                len(pieces),
+            )
+        )
+        tables.pieces.extend(pieces)
+        own = np.eye(len(constants))[a] if weights is None else weights[0, a]
+        tables.weights.append((drives, own))
+
+
+def _write_tests(robot: Mechanism, commanded: BoolArray) -> str:
+    """Return poses within the workspace with their coordinates, readings and derivatives."""
+    coordinates = sample_workspace(robot, TESTS, SEED)
+    slopes = jacobian(robot, coordinates.solution.q, coordinates.solution)
+    poses = slopes.solution.T
+    parts = [
+        f"#define TESTS {len(poses)}",
+        f"#define AGREEMENT {_write(AGREEMENT * max(1.0, robot.size))}",
+        _table("double TEST_COORDINATES[TESTS][KINEMATICS_COORDINATES]", coordinates.coordinates),
+        _table(
+            "double TEST_READINGS[TESTS][KINEMATICS_READINGS]", coordinates.solution.q[:, commanded]
+        ),
+        _table("double TEST_POSES[TESTS][12]", map(_flatten, poses)),
+        _table(
+            "double TEST_SLOPES[TESTS][6][KINEMATICS_READINGS]", slopes.readings[..., commanded]
+        ),
+    ]
+    return "\n".join(parts)
+
+
+FORMAT = Format("c", "kinematics of the identified robot in C99", (".c",), None, write, False)
