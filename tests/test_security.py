@@ -10,6 +10,9 @@ from pathlib import Path
 
 import pytest
 
+from loopcal.engine.selection import VARIABLE
+from loopcal.environment import PINNED
+
 FORBIDDEN_MODULES = {
     "asyncio", "code", "dbm", "ftplib", "http", "imaplib", "marshal", "multiprocessing", "pickle",
     "poplib", "pty", "runpy", "shelve", "smtplib", "socket", "socketserver", "ssl", "subprocess",
@@ -105,6 +108,42 @@ def test_commands_start_no_program_open_no_address_and_write_only_named_files(tm
     assert {path.name for path in tmp_path.iterdir()} == {
         "robot.svg", "data.csv", "truth.yaml", "run", "run.csv",
     }  # fmt: skip
+
+
+STUDY = """\
+format: 1
+title: A study
+robots: [five-bar]
+replicates: 4
+block: 2
+instruments: {tracker: {kinds: [position]}}
+poses: {few: 8}
+"""
+
+
+@pytest.mark.slow
+def test_modules_in_the_current_folder_are_not_imported_by_workers(tmp_path) -> None:
+    (tmp_path / "study.yaml").write_text(STUDY)
+    for name in ("loky", "multiprocessing", "numpy", "pickle", "sitecustomize", "click", "signal"):
+        (tmp_path / f"{name}.py").write_text(f"open('{name}.ran', 'w').close()\n")
+    command = (
+        "import sys; from loopcal.__main__ import run; sys.argv[1:] = sys.argv[1].split(); run()"
+    )
+    words = [sys.executable, "-P", "-c", command, "study run study.yaml -o out --workers 2"]
+    environment = {k: v for k, v in os.environ.items() if k != "PYTHONSAFEPATH"}
+    done = subprocess.run(words, cwd=tmp_path, env=environment, capture_output=True, check=False)
+    assert b"2 of 2 blocks are stored" in done.stdout, done.stderr.decode()
+    assert [path.name for path in tmp_path.glob("*.ran")] == []
+
+
+def test_page_lists_every_variable_that_the_code_reads_or_pins(root: Path) -> None:
+    text = "".join(path.read_text("utf-8") for path in (root / "src").rglob("*.py"))
+    read = re.findall(r"environ(?:\.\w+\(|\[)\"(\w+)\"", text)
+    read += re.findall(r"environ\.get\(name\) for name in \(([^)]*)\)", text)
+    names = {name.strip('" ') for each in read for name in each.split(",")}
+    page = (root / "SECURITY.md").read_text("utf-8")
+    assert {"DISPLAY", "RAY_ADDRESS", "MPLBACKEND", "MATPLOTLIBRC"} <= names
+    assert [name for name in (*sorted(names), *PINNED, VARIABLE) if f"`{name}`" not in page] == []
 
 
 def test_page_names_existing_tests(root: Path) -> None:

@@ -31,14 +31,24 @@ fastest, because the matrices are small and threads wait for each other (5000 po
 """
 
 
+PINNED = dict.fromkeys(THREADS, "1") | {
+    "PYTHONSAFEPATH": "1",
+    "NoDefaultCurrentDirectoryInExePath": "1",
+}
+"""Variables of this process and of those that it starts, and their values. Without the last two,
+Python imports modules from the current folder where it runs a module, as workers do, and Windows
+looks for programs there.
+"""
+
+
 def pin_settings() -> None:
     """Let libraries of this process read settings from nowhere but their own packages.
 
-    Linear algebra gets one thread. matplotlib looks for `matplotlibrc` in the current folder
+    Variables are pinned. matplotlib looks for `matplotlibrc` in the current folder
     first, then at MATPLOTLIBRC, then in the folder of the user: it gets its own file. Where the
     current folder has such a file, matplotlib is imported in another one.
     """
-    os.environ.update(dict.fromkeys(THREADS, "1"))
+    os.environ.update(PINNED)
     os.environ.pop("MPLBACKEND", None)
     package = find_spec("matplotlib")
     if package is None or package.origin is None:
@@ -53,10 +63,10 @@ def pin_settings() -> None:
 
 
 @contextmanager
-def use_one_thread() -> Iterator[None]:
-    """Give processes that the body starts one thread of linear algebra each."""
-    before = {name: os.environ.get(name) for name in THREADS}
-    os.environ.update(dict.fromkeys(THREADS, "1"))
+def pin_processes() -> Iterator[None]:
+    """Give processes that the body starts the pinned variables."""
+    before = {name: os.environ.get(name) for name in PINNED}
+    os.environ.update(PINNED)
     try:
         yield
     finally:

@@ -1,13 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """The same commands write identical bytes, whatever the environment and the current folder are."""
 
+import locale
 import os
 import shutil
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+
+from loopcal.cli.entry_point import main
 
 TARGETS = "pose,x [mm],y [mm]\na,0,330\nb,10,320\n"
 SHORT = """\
@@ -78,6 +82,8 @@ MORE = {
     "another time zone": {"TZ": "America/St_Johns", "PYTHONHASHSEED": "random"},
     "C": {"LC_ALL": "C", "PYTHONCOERCECLOCALE": "0", "PYTHONUTF8": "0"},
     "a decimal comma": {"LC_ALL": "de_DE.UTF-8", "PYTHONHASHSEED": "3"},
+    "a dotless i": {"LC_ALL": "tr_TR.UTF-8", "LANGUAGE": "tr"},
+    "no UTF-8": {"LC_ALL": "de_DE.ISO-8859-1", "PYTHONCOERCECLOCALE": "0", "PYTHONUTF8": "0"},
 }
 
 
@@ -101,11 +107,11 @@ def run_commands(
     return {str(path.relative_to(folder)): path.read_bytes() for path in files}
 
 
-def make_locale(folder: Path, name: str) -> None:
+def make_locale(folder: Path, name: str, encoding: str = "UTF-8") -> None:
     """Make a locale of the operating system, which may lack it; without tools it stays C."""
-    folder.mkdir()
+    folder.mkdir(exist_ok=True)
     if shutil.which("localedef"):
-        words = ["localedef", "-i", name, "-f", "UTF-8", str(folder / f"{name}.UTF-8")]
+        words = ["localedef", "-i", name, "-f", encoding, str(folder / f"{name}.{encoding}")]
         subprocess.run(words, check=False, capture_output=True)
 
 
@@ -123,10 +129,57 @@ def test_files_and_pages_are_identical_in_another_environment(tmp_path, root) ->
     assert list_differences(first, second) == []
 
 
+LOCALES = {
+    "tr_TR.UTF-8": ("tr_TR", "UTF-8"),  # a dotted and a dotless i
+    "de_DE.UTF-8": ("de_DE", "UTF-8"),  # a decimal comma
+    "de_DE.ISO-8859-1": ("de_DE", "ISO-8859-1"),  # no UTF-8
+}
+"""Name -> source and encoding, for the tool `localedef` of the operating system."""
+
+
+@pytest.fixture(params=LOCALES)
+def locale_of_program(request, tmp_path, monkeypatch) -> Iterator[str]:
+    """Set every category of a locale, which is more than Python does when it starts."""
+    usual = locale.setlocale(locale.LC_ALL)
+    try:
+        locale.setlocale(locale.LC_ALL, request.param)
+    except locale.Error:
+        make_locale(tmp_path / "locales", *LOCALES[request.param])
+        monkeypatch.setenv("LOCPATH", str(tmp_path / "locales"))
+        try:
+            locale.setlocale(locale.LC_ALL, request.param)
+        except locale.Error:
+            pytest.skip(f"no locale {request.param}: install the package locales")
+    yield request.param
+    locale.setlocale(locale.LC_ALL, usual)
+
+
+def write_files(folder: Path, monkeypatch, capsys) -> dict[str, bytes]:
+    """Run the commands of SHORT but the last in this process; return files and output."""
+    folder.mkdir()
+    monkeypatch.chdir(folder)
+    codes = [main(command.split()) for command in SHORT.splitlines()[:3]]
+    assert codes == [0, 0, 0]
+    written = {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+    return written | {"printed": "".join(capsys.readouterr()).encode()}
+
+
+@pytest.mark.slow
+def test_files_and_pages_are_identical_in_every_locale(
+    locale_of_program, tmp_path, monkeypatch, capsys
+) -> None:
+    there = write_files(tmp_path / "there", monkeypatch, capsys)
+    locale.setlocale(locale.LC_ALL, "C")
+    here = write_files(tmp_path / "here", monkeypatch, capsys)
+    assert {"robot.svg", "data.csv", "run/result.json"} <= set(here)
+    assert list_differences(there, here) == []
+
+
 @pytest.mark.evidence
 def test_files_and_pages_of_all_commands_are_identical_in_any_environment(tmp_path, root) -> None:
     commands = LONG.format(root=root)
-    make_locale(tmp_path / "locales", "de_DE")
+    for place, of in LOCALES.values():
+        make_locale(tmp_path / "locales", place, of)
     first = run_commands(tmp_path / "first", commands, USUAL)
     codes = {n: text.split(b"\n")[:2] for n, text in first.items() if n.startswith("printed")}
     assert [c for c in codes.values() if c[1] not in (b"0", b"2")] == []

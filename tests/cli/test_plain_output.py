@@ -3,6 +3,7 @@
 
 import os
 import shlex
+import shutil
 import subprocess
 import sys
 
@@ -62,12 +63,15 @@ def test_json_keeps_names_of_files_that_are_not_utf_8(loopcal, folder) -> None:
     )
 
 
-def test_terminal_that_lacks_a_character_shows_its_escape(folder) -> None:
-    words = [sys.executable, "-m", "loopcal", "check", "five-bar"]
+def test_terminal_that_lacks_a_character_shows_a_sign_or_its_escape(folder) -> None:
+    shutil.copy(find_robot_file("five-bar"), "\u540d.yaml")
+    words = [sys.executable, "-m", "loopcal", "check", "\u540d.yaml"]
     latin = {**os.environ, "PYTHONIOENCODING": "latin-1"}
     done = subprocess.run(words, capture_output=True, check=False, env=latin)
     assert done.returncode == 0, done.stderr
-    assert b"\\u2500" in done.stdout
+    assert b"file: \\u540d.yaml" in done.stdout
+    assert b"\n----------" in done.stdout
+    assert max(map(len, done.stdout.splitlines())) <= 80
 
 
 def test_command_to_copy_is_read_by_a_shell_as_it_is(loopcal, folder) -> None:

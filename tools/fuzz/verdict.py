@@ -136,7 +136,7 @@ def _judge_message(case: Case, outcome: Outcome) -> Iterator[Find]:
 def _names_something(case: Case, message: str) -> bool:
     """Return whether a message names a file, an option, an argument or a word of the input."""
     said = "".join(line for line in message.splitlines() if not line.startswith("Hint: see "))
-    if re.search(r"(?<![\w-])--?[a-z]|Missing argument '", said):
+    if re.search(r"(?<![\w-])--?[a-z]|Missing argument '|extra argument", said):
         return True
     names = {part for name in case.files for part in (name, Path(name).name)}
     words = {word.lstrip("-") or "." for word in case.words[1:]}  # "" is the folder

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import codecs
 import os
 import shutil
 import sys
@@ -119,8 +120,8 @@ def silence(stream: TextIO) -> None:
 
 
 def prepare_streams() -> None:
-    """Replace standard streams that are closed, so that no output file takes their place, and
-    escape characters that standard output cannot express.
+    """Replace standard streams that are closed, so that no output file takes their place, and let
+    other signs and escapes stand for characters that they cannot express.
     """
     for descriptor in range(3):
         try:
@@ -131,8 +132,22 @@ def prepare_streams() -> None:
         if getattr(sys, name) is None:
             stream = Path(os.devnull).open("w", encoding="utf-8")  # noqa: SIM115 until the end
             setattr(sys, name, stream)
-    if isinstance(sys.stdout, TextIOWrapper) and sys.stdout.errors == "strict":
-        sys.stdout.reconfigure(errors="backslashreplace")
+    codecs.register_error("loopcal", _express)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper) and stream.errors in ("strict", "backslashreplace"):
+            stream.reconfigure(errors="loopcal")
+
+
+def _express(error: UnicodeError) -> tuple[str | bytes, int]:
+    """Return what stands for the first character that an encoding lacks, and where to go on."""
+    if not isinstance(error, UnicodeEncodeError):
+        raise error
+    sign, error.end = SIGNS.get(error.object[error.start]), error.start + 1
+    return (sign, error.end) if sign else codecs.backslashreplace_errors(error)
+
+
+SIGNS = {"\u2500": "-", "\u2026": "..."}
+"""Signs of our own texts, where the encoding of a terminal lacks them."""
 
 
 def print_message(text: str) -> None:

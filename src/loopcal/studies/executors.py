@@ -13,7 +13,7 @@ from contextlib import AbstractContextManager, contextmanager, suppress
 from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
 from loopcal.checks import POSITIVE, Limit, Limited
-from loopcal.environment import import_optional, use_one_thread
+from loopcal.environment import import_optional, pin_processes
 from loopcal.errors import StudyError
 from loopcal.findings import report_finding
 from loopcal.frozen_dataclass import dataclass
@@ -197,7 +197,7 @@ class _ProcessPool:
             if self.free
             else ProcessPoolExecutor(1, initializer=_begin_worker, initargs=(os.getpid(),))
         )
-        with use_one_thread(), _without_interrupts():  # the first task starts the process
+        with pin_processes(), _without_interrupts():  # the first task starts the process
             future = worker.submit(compute_timed, function, task)
         self.busy[future] = worker
         return future
