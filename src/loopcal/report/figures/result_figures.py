@@ -337,7 +337,9 @@ def _draw_decision(axes: Axes, quantity: str, conformity: Conformity, unit: Unit
         [error], [0.4], xerr=[[error - low], [high - error]], fmt="o", color=AFTER, ms=2 * DOT,
         lw=2 * LINE, capsize=4.0,
     )  # fmt: skip
-    axes.set(xlim=(0.0, right), ylim=(0.0, 1.1), yticks=[])
+    axes.set_xlim(0.0, right)
+    axes.set_ylim(0.0, 1.1)
+    axes.set_yticks([])
     interval = " to ".join(f"{end:.{count_decimals(high, 2)}f}" for end in (low, high))
     numbers = f"{error:.2g} (95 %: {interval}), limit {limit:.3g} {unit.symbol}"
     title = f"largest {quantity} error {numbers}: {conformity.decision.value}"
