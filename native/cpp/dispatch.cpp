@@ -26,7 +26,7 @@ extern const loopcal::Kernels kernels;
 
 namespace {
 
-constexpr int ABI = 9;  // changes with every change of the C interface; library.py states it, too
+constexpr int ABI = 10;  // changes with every change of the C interface; library.py states it, too
 
 struct Set {
     const char *name;
@@ -99,6 +99,18 @@ EXPORT int loopcal_fold_poses(int set, const int64_t *structure, const double *n
                               int64_t n) {
     return list_sets()[set].kernels->fold_poses(structure, numbers, entries, arrays, joints, rows,
                                                 factor, out, is_finite, t, n);
+}
+
+EXPORT int loopcal_fold_compared(int set, const int64_t *structure, const double *numbers,
+                                 const int64_t *entries, const loopcal::Strided *arrays,
+                                 const loopcal::Strided *joints,
+                                 const loopcal::ComparedPoses *measured,
+                                 const loopcal::SolvedPoses *solved, const double *factor,
+                                 double *out, int8_t *is_finite, int64_t n,
+                                 int64_t max_iterations) {
+    return list_sets()[set].kernels->fold_compared(structure, numbers, entries, arrays, joints,
+                                                   measured, solved, factor, out, is_finite, n,
+                                                   max_iterations);
 }
 
 EXPORT int loopcal_compare_poses(int set, const loopcal::Strided *arrays, double *residual,

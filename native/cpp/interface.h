@@ -45,6 +45,23 @@ struct ReachOutput {
     int8_t *status, *sign, *arrives;
 };
 
+// Measured poses of one trial: numbers (count,) ascending, rotations and translations (count, 12) as
+// of compare.h, and whiteners (count, height, 6) of the differences.
+struct ComparedPoses {
+    int64_t count, height;
+    const int64_t *pose;
+    const double *reference, *whitener;
+};
+
+// T (n, 4, 4), joints as of the start, and (n,): residual, iterations, status, sign. strided : the
+// joints again, as input.
+struct SolvedPoses {
+    double *T, *const *joints, *residual;
+    int64_t *iterations;
+    int8_t *status, *sign;
+    const Strided *strided;
+};
+
 struct Kernels {
     int (*fold)(const double *factor, const double *rows, double *out, int64_t t, int64_t m,
                 int64_t p, int64_t stride);
@@ -66,6 +83,11 @@ struct Kernels {
     int (*fold_poses)(const int64_t *structure, const double *numbers, const int64_t *entries,
                       const Strided *arrays, const Strided *joints, const TwistRows *rows,
                       const double *factor, double *out, int8_t *is_finite, int64_t t, int64_t n);
+    // arrays : e, q, T of the start and the numbers of the map; see compared.h
+    int (*fold_compared)(const int64_t *structure, const double *numbers, const int64_t *entries,
+                         const Strided *arrays, const Strided *joints, const ComparedPoses *measured,
+                         const SolvedPoses *solved, const double *factor, double *out,
+                         int8_t *is_finite, int64_t n, int64_t max_iterations);
     // arrays : see compare.h
     int (*compare_poses)(const Strided *arrays, double *residual, double *by_twist, int64_t t,
                          int64_t n);

@@ -3,6 +3,7 @@
 // INSTRUCTION_SET (a namespace) and LANES (doubles of a vector).
 #include "certify.h"
 #include "compare.h"
+#include "compared.h"
 #include "fold.h"
 #include "fold_poses.h"
 #include "interface.h"
@@ -35,6 +36,6 @@ static int call_solve(const int64_t *structure, const double *numbers,
 
 extern const loopcal::Kernels kernels;
 const loopcal::Kernels kernels = {fold,          call_linearize, certify,         reach,     differentiate,
-                                   fold_poses,    compare_poses,  solve_triangles, call_solve};
+                                   fold_poses,    fold_compared,  compare_poses,   solve_triangles, call_solve};
 
 }  // namespace INSTRUCTION_SET

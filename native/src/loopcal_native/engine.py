@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from loopcal.engine import (
     Block,
     ClosureBlocks,
+    ComparedPoses,
     Engine,
     ParameterMap,
     Program,
@@ -44,16 +45,21 @@ from loopcal_native.library import (
     ENDING,
     TASK_FAILED,
     ReachOutput,
+    SolvedPoses,
     allocate,
     as_reals,
     list_instruction_sets,
     load_library,
     require_done,
 )
+from loopcal_native.library import ComparedPoses as ComparedPosesOfLibrary
 from loopcal_native.pose_rows import flatten_rows
 from loopcal_native.programs import flatten_program, require
 from loopcal_native.tasks import NO_TASK, TaskCalls
 from loopcal_native.version import VERSION
+
+MOST_STEPS = 60
+"""Newton steps, as of `loopcal.engine.solve`."""
 
 
 def make_engine(variant: str = "") -> Engine:
@@ -70,7 +76,7 @@ def make_engine(variant: str = "") -> Engine:
     own = NativeFunctions(sets[name])
     functions = own.solve, own.certify, own.reach, own.linearize, own.fold
     functions += own.differentiate, own.fold_poses, own.solve_triangles, own.compare_poses
-    functions += (own.follow,)
+    functions += own.follow, own.fold_compared
     return Engine(f"native:{name}", VERSION, *functions, is_complete=True)
 
 
@@ -346,6 +352,64 @@ class NativeFunctions:
                 )
             )
         return (out if t * n else factor), is_finite
+
+    def fold_compared(
+        self,
+        factor: FloatArray,
+        program: Program,
+        e: FloatArray,
+        q: FloatArray,
+        start: State,
+        inputs: ParameterMap,
+        measured: ComparedPoses,
+    ) -> tuple[State, FloatArray, BoolArray]:
+        """Close the loops of one trial, and fold the rows of its measured poses."""
+        n, flat = start.T.shape[1], flatten_program(program, False)
+        entries, arrays, begin = flatten_inputs(program, e, q, start, inputs, (1, n))
+        width, (count, height) = inputs.pattern.parameters + 1, measured.whitener.shape[:2]
+        factor, pose = as_reals(factor), np.ascontiguousarray(measured.poses, np.int64)
+        reference, whitener = as_reals(measured.reference), as_reals(measured.whitener)
+        require(factor.shape == (1, width, width), f"a factor (1, {width}, {width})")
+        require(start.T.shape == (1, n, 4, 4), "a start (1, n)")
+        is_right = reference.shape == (count, 12) and whitener.shape == (count, height, 6)
+        require(is_right and pose.shape == (count,), "measured poses (r,), (r, 12), (r, m, 6)")
+        require(not count or (pose.min() >= 0 and pose.max() < n), f"poses of {n}")
+        require(bool((pose[1:] >= pose[:-1]).all()), "poses in ascending order")
+        parts = [((1, n, *a.shape[2:]), float) for a in begin]
+        T, residual, iterations, status, sign, is_finite, out, *joints = allocate(
+            ((1, n, 4, 4), float),
+            ((1, n), float),
+            ((1, n), np.int64),
+            ((1, n), np.int8),
+            ((1, n), np.int8),
+            ((1, n), np.bool_),
+            (factor.shape, float),
+            *parts,
+        )
+        addresses, strided = list_addresses(joints), describe_all(joints)
+        outputs = [a.ctypes.data for a in (residual, iterations, status, sign)]
+        lists = ctypes.addressof(addresses), ctypes.addressof(strided)
+        numbers = (a.ctypes.data for a in (pose, reference, whitener))
+        require_done(
+            load_library().loopcal_fold_compared(
+                self.instruction_set,
+                flat.structure.ctypes.data,
+                flat.numbers.ctypes.data,
+                entries.ctypes.data,
+                describe_all(arrays),
+                describe_all(begin),
+                ComparedPosesOfLibrary(count, height, *numbers),
+                SolvedPoses(T.ctypes.data, lists[0], *outputs, lists[1]),
+                factor.ctypes.data,
+                out.ctypes.data,
+                is_finite.ctypes.data,
+                n,
+                MOST_STEPS,
+            )
+        )
+        groups = len(program.groups)
+        others = status, residual, iterations, sign, tuple(joints[groups:])
+        return State(T, tuple(joints[:groups]), *others), out, is_finite
 
     def solve_triangles(
         self, triangle: FloatArray, right: FloatArray

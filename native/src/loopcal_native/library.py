@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-ABI = 9
+ABI = 10
 """The C interface that this package calls; dispatch.cpp states it, too."""
 APART, CHAINED, ENDING = 0, 1, 2
 """Where `loopcal_solve` begins the poses of a trial; interface.h states it, too."""
@@ -35,6 +35,25 @@ class TwistRows(ctypes.Structure):
     """Rows of poses, see interface.h."""
 
     _fields_ = (("count", COUNT), ("pose", ADDRESS), ("by_twist", Strided), ("residual", Strided))
+
+
+class ComparedPoses(ctypes.Structure):
+    """Measured poses, see interface.h."""
+
+    _fields_ = (
+        ("count", COUNT),
+        ("height", COUNT),
+        *((name, ADDRESS) for name in ("pose", "reference", "whitener")),
+    )
+
+
+class SolvedPoses(ctypes.Structure):
+    """Addresses of a state, see interface.h."""
+
+    _fields_ = tuple(
+        (name, ADDRESS)
+        for name in ("T", "joints", "residual", "iterations", "status", "sign", "strided")
+    )
 
 
 class ReachOutput(ctypes.Structure):
@@ -79,6 +98,10 @@ def load_library() -> ctypes.CDLL:
     library.loopcal_differentiate.argtypes = (INT, *(ADDRESS,) * 7, *(COUNT,) * 2)
     library.loopcal_fold_poses.argtypes = (INT, *(ADDRESS,) * 5, ctypes.POINTER(TwistRows))
     library.loopcal_fold_poses.argtypes += (*(ADDRESS,) * 3, *(COUNT,) * 2)
+    library.loopcal_fold_compared.argtypes = (INT, *(ADDRESS,) * 5)
+    library.loopcal_fold_compared.argtypes += (ctypes.POINTER(ComparedPoses),)
+    library.loopcal_fold_compared.argtypes += (ctypes.POINTER(SolvedPoses),)
+    library.loopcal_fold_compared.argtypes += (*(ADDRESS,) * 3, *(COUNT,) * 2)
     library.loopcal_compare_poses.argtypes = (INT, *(ADDRESS,) * 3, *(COUNT,) * 2)
     library.loopcal_solve_triangles.argtypes = (INT, *(ADDRESS,) * 4, *(COUNT,) * 2)
     library.loopcal_solve.argtypes = (INT, *(ADDRESS,) * 4, *(COUNT,) * 3)

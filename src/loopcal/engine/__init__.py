@@ -18,6 +18,7 @@ from loopcal.engine.program import PLATFORM as PLATFORM
 from loopcal.engine.program import STALLED as STALLED
 from loopcal.engine.program import Block as Block
 from loopcal.engine.program import ClosureBlocks as ClosureBlocks
+from loopcal.engine.program import ComparedPoses as ComparedPoses
 from loopcal.engine.program import Group as Group
 from loopcal.engine.program import MapPattern as MapPattern
 from loopcal.engine.program import ParameterMap as ParameterMap
@@ -35,6 +36,7 @@ from loopcal.engine.selection import collect_versions as collect_versions
 from loopcal.engine.selection import compare_poses as compare_poses
 from loopcal.engine.selection import differentiate as differentiate
 from loopcal.engine.selection import fold as fold
+from loopcal.engine.selection import fold_compared as fold_compared
 from loopcal.engine.selection import fold_poses as fold_poses
 from loopcal.engine.selection import follow as follow
 from loopcal.engine.selection import get_current_engine as get_current_engine

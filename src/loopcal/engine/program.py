@@ -387,6 +387,19 @@ class ParameterMap:
 
 
 @dataclass(frozen=True, eq=False)
+class ComparedPoses:
+    """Measured poses of one trial, whose rows are W r of the differences r of `compare_poses`.
+
+    poses : (r,) number of the pose of each measurement, ascending. reference : (r, 12) rotations
+    row by row, then positions. whitener : (r, m, 6) W.
+    """
+
+    poses: IntArray
+    reference: FloatArray
+    whitener: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
 class TwistRows:
     """Whitened rows of poses, m of each of r measurements, as the platform's twist changes them.
 

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from loopcal.engine.program import (
     ClosureBlocks,
+    ComparedPoses,
     ParameterMap,
     Program,
     Reached,
@@ -66,10 +67,10 @@ class Engine:
     """An implementation of the functions whose docstrings are below.
 
     name : as in LOOPCAL_ENGINE, with its variant. version : of the package that computes.
-    solve_triangles, compare_poses, follow : None where the functions of `loopcal.numerics`, of
-        `loopcal.geometry` and `solve` do it. is_complete : whether programs may have nodes but the
-        platform, and sums of driven joints may be given; NumPy computes these for an engine that is
-        not.
+    solve_triangles, compare_poses, follow, fold_compared : None where the functions of
+        `loopcal.numerics`, of `loopcal.geometry`, `solve` and `fold_poses` do it. is_complete :
+        whether programs may have nodes but the platform, and sums of driven joints may be given;
+        NumPy computes these for an engine that is not.
     """
 
     name: str
@@ -84,6 +85,7 @@ class Engine:
     solve_triangles: Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]] | None = None
     compare_poses: Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]] | None = None
     follow: Callable[..., State] | None = None
+    fold_compared: Callable[..., tuple[State, FloatArray, BoolArray]] | None = None
     is_complete: bool = False
 
     def __str__(self) -> str:
@@ -313,6 +315,30 @@ def fold_poses(
     """
     arguments = program, e, q, state, inputs, observed
     return _get_engine_for(program).fold_poses(factor, *arguments)
+
+
+def fold_compared(
+    factor: FloatArray,
+    program: Program,
+    e: FloatArray,
+    q: FloatArray,
+    start: State,
+    inputs: ParameterMap,
+    measured: ComparedPoses,
+) -> tuple[State, FloatArray, BoolArray] | None:
+    """Close the loops of one trial and fold the rows of its measured poses: `solve` from a start
+    (1, n), `compare_poses`, and `fold_poses` of the whitened differences. Rows of poses that are
+    not solved are not defined.
+
+    Returns
+    -------
+    The state (1, n), and what `fold_poses` returns. None where the engine leaves this to these
+    functions.
+    """
+    current = _get_engine_for(program)
+    if current.fold_compared is None or program.idle_groups:
+        return None
+    return current.fold_compared(factor, program, e, q, start, inputs, measured)
 
 
 def solve_triangles(

@@ -54,7 +54,9 @@ from loopcal.estimate.pose_coordinates import PoseCoordinates
 from loopcal.findings import report_finding
 from loopcal.frozen_dataclass import dataclass
 from loopcal.mechanism.actuation import drive_joints
+from loopcal.mechanism.kinematics import find_wrong_rows, is_square
 from loopcal.mechanism.sensitivity import fold_pose_rows
+from loopcal.mechanism.states import Status
 from loopcal.numerics.decomposition import NULL_COMPONENT, empty_factor
 from loopcal.numerics.elimination import (
     Elimination,
@@ -155,6 +157,22 @@ class PoseRows:
         robot = self.free.robot
         has_more = self.free.errors is not None or robot.stages or robot.has_open_sums
         return is_simple and not (has_more or robot.program.may_stay_open)
+
+    @cached_property
+    def compared(self) -> engine.ComparedPoses | None:
+        """The rows of one trial as the engine compares them with poses that it solves; None where
+        it cannot, or where poses may have to be solved again.
+        """
+        robot = self.free.robot
+        is_simple = is_square(robot) and not robot.is_serial
+        if not (self.are_plain and self.is_kept and is_simple and len(self.rows) == 1):
+            return None
+        rows, columns = self.rows[0], self.rows[0].take_trials(np.zeros(1, dtype=np.int64))[0]
+        is_one = len(rows.measured) == len(rows.whitener) == 1 and rows.offset is None
+        pairs = rows.kind.compare_platform(columns) if is_one and columns.is_complete else None
+        if pairs is None or (rows.poses[1:] < rows.poses[:-1]).any():
+            return None
+        return engine.ComparedPoses(rows.poses, pairs[0][0], rows.whitener[0] @ pairs[1])
 
     @property
     def is_kept(self) -> bool:
@@ -292,6 +310,28 @@ class PoseRows:
             factor, is_finite = fold_pose_rows(robot, *inputs, solution.driven)
             is_lost |= np.any(~(poses.is_reached & is_finite) & block.is_needed, axis=1)
         return factor, is_lost
+
+    def fold_compared(
+        self, factor: FloatArray, z: FloatArray, begin: PoseStates
+    ) -> tuple[FloatArray, PoseStates] | None:
+        """Solve the poses of one trial and fold their rows by one call of the engine; return also
+        the states. None where the engine does not, or where a pose is not solved.
+        """
+        if self.compared is None:
+            return None
+        robot, q = self.free.robot, self.coordinates.readings
+        values = self.free.values(z)
+        e, tau, joints = drive_joints(robot, values, q)
+        inputs = self.free.columns.linearize(values, tau, q)
+        at = robot.program, e, joints, begin.state, inputs
+        done = engine.fold_compared(factor, *at, self.compared)
+        if done is None:
+            return None
+        state, factor, is_finite = done
+        is_solved = (state.status == Status.CONVERGED.value).all() and is_finite.all()
+        if not is_solved or find_wrong_rows(robot, state, begin.state).any():
+            return None
+        return factor, PoseStates(state, begin.q)
 
     def linearize_kinds(
         self,

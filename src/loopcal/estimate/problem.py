@@ -326,6 +326,12 @@ class Problem:
         begins at `start`.
         """
         t, known, poses, folds = len(self), None, self.poses, self.folds_plain_rows
+        if folds and t == 1 and start.poses is not None:
+            done = poses.fold_compared(empty_factor(1, self.parameters), deviation, start.poses)
+            if done is not None:
+                near = replace(start, deviation=deviation, poses=done[1], is_near=True)
+                cost = (done[0][:, :, -1] ** 2).sum(axis=1)
+                return Linearization(deviation, done[0], cost, self.residual_count, near)
         are_shared = poses.is_kept and poses.coordinates.are_shared
         if are_shared and t > 1 and (deviation == deviation[0]).all():
             known = poses.solve_exact_poses(deviation[:1], start, not folds)

@@ -569,6 +569,14 @@ class Kind(ABC):
         present, reference = self.detect_present(measured), self._compute_reference(columns)
         return MeasuredColumns(columns, reference, present, bool(np.all(present)))
 
+    def compare_platform(self, measured: MeasuredColumns) -> tuple[FloatArray, FloatArray] | None:
+        """Return references (t, r, 12), and S (m, 6) with which the residuals are S times the
+        differences of the platform's poses from these, see `engine.compare_poses`; None where they
+        are not.
+        """
+        del measured
+        return None
+
     def evaluate(
         self,
         T: FloatArray,

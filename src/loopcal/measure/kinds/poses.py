@@ -21,6 +21,7 @@ from loopcal.measure.kinds.kind import (
     Evaluation,
     InvalidRows,
     Kind,
+    MeasuredColumns,
     checked,
     is_incomplete,
     list_not_unit,
@@ -222,6 +223,10 @@ class Pose(ToolKind):
         R = self.form.to_matrix(self._fill_orientation(measured))
         return np.concatenate([R.reshape(*R.shape[:-2], 9), measured[..., -3:]], axis=-1)
 
+    def compare_platform(self, measured: MeasuredColumns) -> tuple[FloatArray, FloatArray] | None:
+        """Return the measured poses, all of whose differences are residuals."""
+        return (measured.reference, np.eye(6)) if self.measures_platform else None
+
     def _evaluate(
         self, T: FloatArray, measured: FloatArray, values: FloatArray, joints: FloatArray
     ) -> Evaluation:
@@ -409,6 +414,16 @@ class Component(ToolKind):
     def placeholder(self) -> FloatArray:
         """NaN: only its own component depends on it, unless the normal replaces two of them."""
         return np.full(1, np.nan)
+
+    def compare_platform(self, measured: MeasuredColumns) -> tuple[FloatArray, FloatArray] | None:
+        """Return places with any rotation, where all components are those of a place."""
+        if self.form is not None or not self.measures_platform:
+            return None
+        columns = [3 + POSITION_AXES.index(name) for name in self.components]
+        reference = np.zeros((*measured.columns.shape[:-1], 12))
+        reference[..., [0, 4, 8]] = 1.0
+        reference[..., [6 + column for column in columns]] = measured.columns
+        return reference, np.eye(6)[columns]
 
     def _predict(self, T: FloatArray, values: FloatArray, joints: FloatArray) -> Evaluation:
         tool, by_tool = self.locate_tool(T, values)

@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One call gives what solving, comparing and folding give one after the other."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from loopcal import engine as api
+from loopcal.engine import ComparedPoses, TwistRows
+from loopcal.numerics.trial_batch import map_arrays
+from tests.engine.cases import draw_map
+from tests.engine.native.instruction_sets import list_arrays, make_engines, make_robot_case
+from tests.engine.test_compare_poses import draw_poses
+
+ENGINES = list(make_engines().values())
+HEIGHTS = (6, 3, 1)
+NAMES = ("hexapod-42", "linear-delta", "3-rrr", "6-rus", "tricept")
+
+
+def draw_measured(n: int, height: int) -> ComparedPoses:
+    """Draw measurements of two poses of three, with whiteners that mix the components."""
+    rng, poses = np.random.default_rng(height), np.flatnonzero(np.arange(n) % 3)
+    reference = draw_poses(0.4, 1, len(poses))[1][0]
+    return ComparedPoses(poses, reference, rng.normal(size=(len(poses), height, 6)))
+
+
+def make_arguments(name: str, n: int):
+    """Return the arguments of `fold_compared` between the factor and the measured poses."""
+    case = make_robot_case(name, 1, n)
+    start = map_arrays(lambda a: np.broadcast_to(a, (1, n, *a.shape[2:])), case.home)
+    return case.program, case.e, case.q, start, draw_map(case.program, (1, n), False)
+
+
+@pytest.mark.parametrize("engine", ENGINES, ids=str)
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("height", HEIGHTS)
+def test_one_call_gives_what_three_give(engine, name, height):
+    arguments, n = make_arguments(name, 21), 21
+    program, e, q, start, inputs = arguments
+    measured, p = draw_measured(n, height), inputs.pattern.parameters
+    factor = np.triu(np.random.default_rng(1).normal(size=(1, p + 1, p + 1)))
+    state, folded, is_finite = engine.fold_compared(factor, *arguments, measured)
+    alone = engine.solve(program, e, q, start)
+    for ours, theirs in zip(list_arrays(state).values(), list_arrays(alone).values(), strict=True):
+        assert_array_equal(ours, theirs)
+    residual, slopes = engine.compare_poses(alone.T[:, measured.poses], measured.reference[None])
+    # the sums of the library, in its order
+    white = np.zeros((len(measured.poses), height, 7))
+    for j in range(6):
+        both = np.concatenate([slopes[0, :, j], residual[0, :, j, None]], axis=1)
+        white = white + measured.whitener[:, :, j, None] * both[:, None]
+    rows = TwistRows(measured.poses, white[None, ..., :6], white[None, ..., 6])
+    expected, known = engine.fold_poses(factor, program, e, q, alone, inputs, [rows])
+    assert_array_equal(folded, expected)
+    assert_array_equal(is_finite, known)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_all_instruction_sets_give_the_same_bits(name):
+    arguments, measured = make_arguments(name, 21), draw_measured(21, 6)
+    p = arguments[4].pattern.parameters
+    factor = np.zeros((1, p + 1, p + 1))
+    results = [e.fold_compared(factor, *arguments, measured) for e in ENGINES]
+    first, *others = ([*list_arrays(r[0]).values(), *r[1:]] for r in results)
+    for other in others:
+        for ours, theirs in zip(first, other, strict=True):
+            assert_array_equal(ours, theirs)
+
+
+@pytest.mark.parametrize("engine", ENGINES, ids=str)
+def test_measured_poses_of_wrong_shapes_are_refused(engine):
+    arguments, measured = make_arguments("hexapod-42", 9), draw_measured(9, 6)
+    p = arguments[4].pattern.parameters
+    factor, white = np.zeros((1, p + 1, p + 1)), measured.whitener
+    wrong = [
+        ComparedPoses(measured.poses + 1, measured.reference, white),
+        ComparedPoses(measured.poses - 2, measured.reference, white),
+        ComparedPoses(measured.poses[::-1], measured.reference, white),
+        ComparedPoses(measured.poses, measured.reference[:, :9], white),
+        ComparedPoses(measured.poses, measured.reference[1:], white),
+        ComparedPoses(measured.poses, measured.reference, white[..., :5]),
+    ]
+    for one in wrong:
+        with pytest.raises(ValueError, match="poses"):
+            engine.fold_compared(factor, *arguments, one)
+    with pytest.raises(ValueError, match="factor"):
+        engine.fold_compared(factor[:, :-1], *arguments, measured)
+
+
+def test_a_measured_pose_gives_a_residual_of_zero_at_itself():
+    program, e, q, start, inputs = make_arguments("hexapod-42", 9)
+    T = api.solve(program, e, q, start).T[0]
+    reference = np.concatenate([T[:, :3, :3].reshape(9, 9), T[:, :3, 3]], axis=1)
+    whitener = np.broadcast_to(np.eye(6), (9, 6, 6))
+    p = inputs.pattern.parameters
+    for engine in ENGINES:
+        measured = ComparedPoses(np.arange(9), reference, whitener)
+        zeros = np.zeros((1, p + 1, p + 1))
+        _, factor, _ = engine.fold_compared(zeros, program, e, q, start, inputs, measured)
+        assert_allclose(factor[0, :, p], 0.0, atol=1e-14)  # [rad, m]: rounding of poses
