@@ -17,6 +17,7 @@ directions. No matrix is inverted. See docs/theory/uncertainty.md.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import cache
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -40,6 +41,7 @@ from loopcal.mechanism.states import Status
 from loopcal.mechanism.workspace import sample_workspace
 from loopcal.numerics.decomposition import NULL_COMPONENT
 from loopcal.numerics.statistics import compute_f_tail
+from loopcal.results.deferred import DeferredFields, deferred, later
 from loopcal.results.description import Field, fields, label_axes
 from loopcal.results.result import TableResult
 from loopcal.typing import FloatArray, IntArray
@@ -102,8 +104,8 @@ LEAST_PART = 0.3
 EQUAL = 1e-6
 
 
-@dataclass(frozen=True, eq=False)
-class ValueComparison(TableResult):
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ValueComparison(DeferredFields, TableResult):
     """A fit against given values of its parameters; arrays (k,) in the order of `names`.
 
     Attributes
@@ -135,8 +137,8 @@ class ValueComparison(TableResult):
     degrees: int
     chi_square: float
     p_value: float
-    second_order: float
-    is_linear: bool
+    second_order: float = deferred()
+    is_linear: bool = deferred()
     noise: str
     sigma: float
     direction: tuple[str, ...]
@@ -344,7 +346,7 @@ def _compare(fit: Identification, indices: IntArray, given: FloatArray) -> Value
     tested = _find_complement(directions[:, is_open])
     y = tested.T @ (raw / tolerance)
     known = np.where(is_open, 0.0, posterior.variance)
-    whitened, u, second_order = np.full(len(y), np.nan), np.eye(len(y)), np.nan
+    whitened, u, change = np.full(len(y), np.nan), np.eye(len(y)), None
     left = np.inf
     if np.isfinite(known).all() and len(y):
         scaled = directions * np.sqrt(known)
@@ -352,7 +354,6 @@ def _compare(fit: Identification, indices: IntArray, given: FloatArray) -> Value
         whitened = (u.T @ y) / s
         # the most probable change of all parameters with this difference of the compared ones
         change = posterior.directions @ (np.sqrt(known) * (wt.T @ whitened))
-        second_order = measure_second_order(posterior, posterior.unit * change)
         whitening = np.zeros((len(y), len(posterior.unit)))
         whitening[:, indices] = ((u / s).T @ tested.T) / tolerance
         left = float(posterior.count_degrees(whitening))
@@ -366,13 +367,24 @@ def _compare(fit: Identification, indices: IntArray, given: FloatArray) -> Value
         sigma = float(abs(whitened[worst]))
         direction = tuple(names[i] for i in order[:MOST_NAMED])
     is_cut = comparable.shape[1] < len(names)
-    roots = np.sqrt(chi_square) + np.array([0.0, -1.0, 1.0]) * np.sqrt(second_order)
-    p_value, *bounds = (
-        float(compute_f_tail(len(y), left, max(root, 0.0) ** 2 / len(y)))
-        if len(y) and np.isfinite(root)
-        else float("nan")
-        for root in roots
-    )
+
+    def compute_tail(root: float) -> float:
+        if not (len(y) and np.isfinite(root)):
+            return float("nan")
+        return float(compute_f_tail(len(y), left, max(root, 0.0) ** 2 / len(y)))
+
+    @cache
+    def measure_bend() -> float:
+        if change is None:
+            return np.nan
+        return measure_second_order(posterior, posterior.unit * change)
+
+    def decide_linearity() -> bool:
+        step = np.array([-1.0, 1.0]) * np.sqrt(measure_bend())
+        bounds = map(compute_tail, np.sqrt(chi_square) + step)
+        return len({bound >= SIGNIFICANCE for bound in bounds}) == 1 and p_value >= 0.0
+
+    p_value = compute_tail(np.sqrt(chi_square))
     return ValueComparison(
         names=names,
         raw=raw,
@@ -383,8 +395,8 @@ def _compare(fit: Identification, indices: IntArray, given: FloatArray) -> Value
         degrees=len(y),
         chi_square=chi_square,
         p_value=p_value,
-        second_order=second_order,
-        is_linear=len({bound >= SIGNIFICANCE for bound in bounds}) == 1 and p_value >= 0.0,
+        second_order=later(measure_bend),
+        is_linear=later(decide_linearity),
         noise="widened" if fit.residual_test.exceeds_sigma else fit.residual_test.noise,
         sigma=sigma,
         direction=direction,

@@ -94,7 +94,10 @@ class SmoothErrors:
 
     def recentered(self, T: FloatArray, most: int = FINE_CENTERS) -> SmoothErrors:
         """Return the errors with up to `most` of the poses T (n, 4, 4) as centers."""
-        x = self.normalize(T)
+        return self._centered(self.normalize(T), most)
+
+    def _centered(self, x: FloatArray, most: int) -> SmoothErrors:
+        """Return the errors with up to `most` of normalized coordinates (n, 6) as centers."""
         centers = x[_spread(x, most)]
         triangle = np.linalg.cholesky(correlate(centers, centers) + JITTER * np.eye(len(centers)))
         whitening = np.asarray(np.linalg.inv(triangle).T, dtype=np.float64)
@@ -170,7 +173,7 @@ def describe_smooth_errors(
     scale = np.where(used, length * np.where(used, half, 1.0), np.inf)
     nothing = np.zeros((0, 6))
     errors = SmoothErrors(tool, rotation, origin, scale, nothing, nothing, np.eye(6))
-    return errors.recentered(T, most)
+    return errors._centered((x - origin) / scale, most)
 
 
 def _spread(x: FloatArray, most: int, apart: float = SAME) -> list[int]:

@@ -273,14 +273,15 @@ def _tail(values: FloatArray, counts: FloatArray) -> float:
         return 1.0 if values.min() >= 0.0 else 0.0
     low, high = 0.5 / values.min(), 0.5 / values.max()
 
-    def slope(t: float) -> float:
-        return float((counts * values / (1.0 - 2.0 * t * values)).sum())
-
     t = 0.0
-    for _ in range(NEWTON):  # K' grows: bisection cannot fail
-        low, high = (t, high) if slope(t) < 0.0 else (low, t)
-        before, t = t, 0.5 * (low + high)
-        if t == before:
+    for _ in range(NEWTON):  # K' grows: Newton's method between the ends, else bisection
+        tilted = values / (1.0 - 2.0 * t * values)
+        slope, curvature = float(counts @ tilted), 2.0 * float(counts @ tilted**2)
+        low, high = (t, high) if slope < 0.0 else (low, t)
+        before, t = t, t - slope / curvature
+        if not low < t < high:
+            t = 0.5 * (low + high)
+        if abs(t - before) <= 1e-15 * abs(before):
             break
     return _tail_beyond_slope(values, counts, t)
 
