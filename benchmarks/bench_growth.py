@@ -14,12 +14,14 @@ from benchmarks.harness import Metric, measure_ratio, time_once
 from loopcal.apply.calibration import calibrate
 from loopcal.apply.calibration_options import CalibrationOptions
 from loopcal.apply.compensation import compensate
+from loopcal.geometry import exp_so3, make_pose
 from loopcal.io.data.measurement_file import load_measurements
 from loopcal.io.data.measurement_writer import save_measurements
 from loopcal.io.robot.robot_file import load_robot
 from loopcal.io.runs.result_files import format_compensation
 from loopcal.measure.instrument import Gaussian, Instrument, Sensor
 from loopcal.measure.kinds.poses import Component
+from loopcal.measure.kinds.position import Position
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.simulation import sample_truth, simulate
 from loopcal.mechanism.model import Mechanism
@@ -42,6 +44,21 @@ def _measured(robot: Mechanism, n: int) -> Measurements:
     """A machine drawn from the tolerances, whose position is measured in n poses."""
     truth = robot.with_values(sample_truth(robot, 1, 0)[0])
     sensor = Sensor(Component(("x", "y", "z")), Gaussian(np.full(3, 10 * UM)))
+    return simulate(truth, _targets(robot, n), Instrument((sensor,)), 0)
+
+
+def draw_sessions(robot: Mechanism, n: int, sessions: int, targets: int) -> Measurements:
+    """Draw a machine whose targets a tracker measures to 10 um in n poses; frame and targets are
+    unknown in every session.
+    """
+    truth, rng = robot.with_values(sample_truth(robot, 1, 0)[0]), np.random.default_rng(1)
+    names = tuple(f"t{i}" for i in range(targets))
+    places = robot.tool[:3, 3] + rng.uniform(-0.05, 0.05, (targets, 3))
+    station = make_pose(exp_so3(np.array([0.1, -0.2, 0.7])), np.array([-1.2, 0.4, 0.3]))
+    unknown = ("frame", "targets")
+    kind = Position(targets=names, places=places, T_base_frame=station, unknown=unknown)
+    session = np.array([f"s{i * sessions // n}" for i in range(n)])
+    sensor = Sensor(kind, Gaussian(np.full(3 * targets, 10 * UM)), session=session)
     return simulate(truth, _targets(robot, n), Instrument((sensor,)), 0)
 
 

@@ -136,14 +136,14 @@ def ask_estimate(robot: Mechanism, data: Measurements) -> by_hand.Answer:
     return fit.estimate, fit.covariance
 
 
-def compile_ceres(folder: Path) -> tuple[Path, str] | None:
+def compile_ceres(folder: Path, source: Path = SOURCE) -> tuple[Path, str] | None:
     """Return the compiled program and the version of Ceres; None where a part is missing."""
     compiler = which(os.environ.get("CXX", "g++"))
     if compiler is None or not Path("/usr/include/ceres/ceres.h").is_file():
         return None
     program = folder / "fit"
     options = ["-O3", "-std=c++17", "-I/usr/include/eigen3"]
-    command = [compiler, *options, str(SOURCE), "-o", str(program), "-lceres", "-lglog"]
+    command = [compiler, *options, str(source), "-o", str(program), "-lceres", "-lglog"]
     subprocess.run(command, check=True)
     first = subprocess.run([compiler, "--version"], capture_output=True, text=True, check=True)
     return program, first.stdout.splitlines()[0]
@@ -151,7 +151,11 @@ def compile_ceres(folder: Path) -> tuple[Path, str] | None:
 
 def run_ceres(program: Path, robot: str, numbers: Path, repeats: int) -> dict[str, list[str]]:
     """Return the words that the program printed, by the first one of each line."""
-    command = [str(program), robot, str(numbers), str(repeats)]
+    return read_words([str(program), robot, str(numbers), str(repeats)])
+
+
+def read_words(command: list[str]) -> dict[str, list[str]]:
+    """Return the words that a program prints, by the first one of each line."""
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     return {line.split()[0]: line.split()[1:] for line in done.stdout.splitlines()}
 
