@@ -10,6 +10,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import loopcal.estimate.pose_rows as blocks_module
+from loopcal.estimate.elimination import fold_components
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.identification import identify
 from loopcal.estimate.information import observe_poses, observe_rows
@@ -343,3 +344,27 @@ def test_fit_of_planes_that_share_a_probe_converges():
     assert (
         fit.rank == 30
     )  # of 42, less the frames of the base and of the tool: the probe and the planes are free
+
+
+def test_components_of_many_targets_are_folded_by_their_own_columns():
+    """The factor of the shorter rows is that of all rows; three components of each target use
+    three columns of their own and six of the frame.
+    """
+    rng = np.random.default_rng(0)
+    k, targets, frame, p = 40, 12, 6, 5
+    width = frame + 3 * targets
+    rows = np.zeros((1, k, 3 * targets, width + p + 1))
+    rows[..., :frame] = rng.standard_normal((*rows.shape[:3], frame))
+    rows[..., width:] = rng.standard_normal((*rows.shape[:3], p + 1))
+    for j in range(targets):
+        own = slice(frame + 3 * j, frame + 3 * j + 3)
+        rows[:, :, 3 * j : 3 * j + 3, own] = rng.standard_normal((1, k, 3, 3))
+    nodes = np.arange(k) % 2
+    short = fold_components(rows, width, nodes, 2)
+    assert short is not None
+    assert short.shape[1] < 0.6 * k * 3 * targets
+    for node, own in enumerate(np.split(short[0], 2)):
+        whole = rows[0, nodes == node].reshape(-1, width + p + 1)
+        assert_allclose(own.T @ own, whole.T @ whole, atol=1e-10)
+    few = np.concatenate([rows[:, :, :6, :12], rows[:, :, :6, width:]], axis=3)
+    assert fold_components(few, 12, nodes, 2) is None

@@ -25,13 +25,19 @@ from loopcal.measure.nuisance import NuisanceParameters
 from loopcal.measure.observations import Observations
 from loopcal.numerics.elimination import find_connected_groups
 from loopcal.numerics.gauss_newton import STEPS, minimize_from_starts, sum_squares
-from loopcal.numerics.statistics import find_distinct
+from loopcal.numerics.statistics import choose_evenly, find_distinct
 from loopcal.parameters import ParameterTable
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
 ALIKE = 1.0
 """Sum of squares, in variances of the noise, by which one solution fits better than another without
 being told from it: one standard deviation.
+"""
+
+
+FEWEST_ROWS, VALUES = 60, 20.0
+"""Rows of a group, and values for each of its unknowns, from which start values are sought: more
+would make them no better, since the geometry of the robot is not known yet.
 """
 
 
@@ -246,7 +252,9 @@ def _list_groups(
         order = np.argsort(member.ravel(), kind="stable")
         ends = np.cumsum(np.bincount(member.ravel(), minlength=len(sets)))[:-1]
         parts = np.split(counts[order], ends) if len(sets) else []
-        listed += [(i, own, indices) for own, indices in zip(parts, sets, strict=True)]
+        unknowns = len(rows.kind.nuisance_parameters)
+        for own, indices in zip(parts, sets, strict=True):
+            listed.append((i, _choose_rows(rows.present[own], unknowns, own), indices))
     listed.sort(key=lambda g: (kinds[g[0]][0], kinds.index(kinds[g[0]]), -len(g[1])))
     # a group comes in a later turn than those before it with which it shares an unknown parameter
     turn, turns = np.zeros(len(known), dtype=np.int64), defaultdict(list)
@@ -272,6 +280,16 @@ def _list_groups(
         if not is_alone:
             for *_, indices in together:
                 known[indices] = True
+
+
+def _choose_rows(present: BoolArray, unknowns: int, rows: IntArray) -> IntArray:
+    """Return the rows (r,) of a group, of which components (r, m) are present, that give its start
+    values: an even choice of enough of them, unless it lacks most values of a component.
+    """
+    most = max(FEWEST_ROWS, int(VALUES * unknowns / present.shape[1]))
+    chosen = choose_evenly(len(rows), most)
+    left, whole = present[chosen].sum(axis=0), present.sum(axis=0)
+    return rows[chosen] if (left >= np.minimum(whole, most // 2)).all() else rows
 
 
 def _find_clusters(nuisance: NuisanceParameters) -> IntArray:
