@@ -329,7 +329,7 @@ class PoseRows:
             return None
         state, factor, is_finite = done
         is_solved = (state.status == Status.CONVERGED.value).all() and is_finite.all()
-        if not is_solved or find_wrong_rows(robot, state, begin.state).any():
+        if not is_solved or find_wrong_rows(robot, state, begin.state.closure_sign).any():
             return None
         return factor, PoseStates(state, begin.q)
 

@@ -5,8 +5,11 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+import loopcal as lc
+from benchmarks.peers.__main__ import make_cases
 from loopcal import engine as api
 from loopcal.engine import ComparedPoses, TwistRows
+from loopcal.estimate import pose_rows
 from loopcal.numerics.trial_batch import map_arrays
 from tests.engine.cases import draw_map
 from tests.engine.native.instruction_sets import list_arrays, make_engines, make_robot_case
@@ -98,3 +101,24 @@ def test_a_measured_pose_gives_a_residual_of_zero_at_itself():
         zeros = np.zeros((1, p + 1, p + 1))
         _, factor, _ = engine.fold_compared(zeros, program, e, q, start, inputs, measured)
         assert_allclose(factor[0, :, p], 0.0, atol=1e-14)  # [rad, m]: rounding of poses
+
+
+@pytest.mark.parametrize("key", ["hexapod", "delta"])
+def test_a_fit_of_exact_poses_needs_no_other_call(key, monkeypatch):
+    case = make_cases()[key]
+    expected = lc.identify(case.robot, case.data, lc.LeastSquares())
+    monkeypatch.setattr(pose_rows, "fold_pose_rows", None)
+    fit = lc.identify(case.robot, case.data, lc.LeastSquares())
+    assert_array_equal(fit.estimate, expected.estimate)
+
+
+@pytest.mark.parametrize("key", ["hexapod", "delta"])
+def test_a_fit_by_one_call_is_that_by_three(key, monkeypatch):
+    case = make_cases()[key]
+    fit = lc.identify(case.robot, case.data, lc.LeastSquares())
+    monkeypatch.setattr(pose_rows.engine, "fold_compared", lambda *_: None)
+    other = lc.identify(case.robot, case.data, lc.LeastSquares())
+    # 1e-11 standard deviations: rounding of whitened rows
+    assert_allclose(
+        fit.estimate, other.estimate, rtol=0, atol=1e-11 * fit.standard_deviations.min()
+    )
