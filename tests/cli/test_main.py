@@ -62,7 +62,7 @@ def test_large_packages_are_not_imported_before_a_command_runs() -> None:
 
 UNUSED = {
     *("matplotlib", "jinja2", "rich", "pandas", "xarray", "msgspec", "loky"),
-    *("scipy", "numpy.fft", "concurrent.futures", "importlib.metadata"),
+    *("scipy", "numpy.ma", "numpy.fft", "concurrent.futures", "importlib.metadata"),
     *("loopcal.planning", "loopcal.studies", "loopcal.documents", "loopcal.report.figures"),
     *("loopcal.apply.compensation", "loopcal.apply.run_comparison"),
     *("loopcal.diagnose.cross_validation", "loopcal.diagnose.bootstrap"),

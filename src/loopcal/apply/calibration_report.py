@@ -35,6 +35,7 @@ from loopcal.frozen_dataclass import dataclass
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import InstrumentRecord, list_instruments
 from loopcal.mechanism.model import Mechanism
+from loopcal.numerics.statistics import find_distinct
 from loopcal.results.deferred import DeferredFields, deferred
 from loopcal.results.description import Field, Records, fields
 from loopcal.results.result import TableResult
@@ -184,7 +185,7 @@ class CalibrationReport(DeferredFields, TableResult):
         fit = self.identification
         setup = {} if fit.nuisance is None else fit.nuisance.values
         for data in (self.split.held_out, self.split.fitted) if fit.converged else ():
-            if data is not None and len(np.unique(data.repeats)) < data.n_poses:
+            if data is not None and len(find_distinct(data.repeats)) < data.n_poses:
                 try:
                     return assess_repeatability(self.robot, data, setup)
                 except DataError:  # no positions or orientations

@@ -21,6 +21,7 @@ import numpy as np
 
 from loopcal import geometry
 from loopcal.frozen_dataclass import dataclass, replace
+from loopcal.numerics.statistics import compute_median
 from loopcal.typing import FloatArray, IntArray
 
 CENTERS = 40
@@ -80,7 +81,7 @@ class SmoothErrors:
         one; otherwise errors of this length look like noise.
         """
         shared = correlate(self.centers, self.centers) - np.eye(len(self.centers))
-        return bool(np.median(shared.max(axis=1)) > DENSE)
+        return compute_median(shared.max(axis=1)) > DENSE
 
     def group_regions(self, T: FloatArray, fewest: int = 1) -> IntArray:
         """Return the numbers (n,) of regions of poses T (n, 4, 4): each pose belongs to the nearest

@@ -16,6 +16,7 @@ import numpy as np
 
 from loopcal.measure.observations import Observations
 from loopcal.numerics.distributions import binomial_tail
+from loopcal.numerics.statistics import compute_median, compute_quantiles
 from loopcal.typing import FloatArray, IntArray
 
 # Standard deviations of the noise by which repeats may differ. The readings of a few visits span
@@ -27,7 +28,7 @@ SIGMAS = 3.0
 LARGEST_SHARE = 1e-3
 # Least range of a reading, as a share of the largest one: measurements of one pose have no range.
 LEAST_RANGE = 1e-2
-RANGE = (10.0, 90.0)  # percentiles, so that a wrong row does not change the tolerance
+RANGE = (0.1, 0.9)  # quantiles, so that a wrong row does not change the tolerance
 MISSING = 1e300  # stands for readings that are NaN: equal to each other
 STEP, STEPS = 4.0, 8  # factor and number of the finer gaps at which long chains are divided
 
@@ -48,14 +49,14 @@ def find_reading_tolerance(
         for i, column in enumerate(o.kind.noise_columns):
             seen = o.present[:, i] & (o.weight > 0.0)
             if seen.any() and column.name in places:
-                span = np.ptp(np.percentile(o.measured[seen, places[column.name]], RANGE))
-                sd = float(np.median(np.sqrt(o.covariance[seen, i, i])))
+                span = np.ptp(compute_quantiles(o.measured[seen, places[column.name]], RANGE))
+                sd = compute_median(np.sqrt(o.covariance[seen, i, i]))
                 share = min(share, SIGMAS * sd / span) if span > 0.0 else share
     is_known = np.isfinite(readings)
     first = np.take_along_axis(readings, is_known.argmax(axis=0)[None], axis=0)
     known = np.where(is_known, readings, np.nan_to_num(first))
     least = LEAST_RANGE * np.abs(known).max(initial=0.0)
-    tolerance = share * np.maximum(np.ptp(np.percentile(known, RANGE, axis=0), axis=0), least)
+    tolerance = share * np.maximum(np.ptp(compute_quantiles(known, RANGE), axis=0), least)
     if reading_sigma is not None:
         jitter = np.median(np.where(np.isfinite(reading_sigma), reading_sigma, 0.0), axis=0)
         tolerance = np.maximum(tolerance, 2.0 * SIGMAS * jitter)

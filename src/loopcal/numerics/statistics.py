@@ -337,13 +337,14 @@ def invert_increasing(
 # Distinct values and medians without masked arrays.
 
 
-def find_distinct(values: NDArray[Any]) -> NDArray[Any]:
-    """Return the distinct values of an array, of any shape and type, in ascending order.
+def find_distinct(values: NDArray[Any], axis: int | None = None) -> NDArray[Any]:
+    """Return the distinct values of an array, of any shape and type, in ascending order; or its
+    distinct parts along an axis.
 
     They are those of `np.unique`. With `return_counts`, it does not ask whether the array is masked
     (numpy 2.4).
     """
-    return np.unique(values, return_counts=True)[0]
+    return np.unique(values, return_counts=True, axis=axis)[0]
 
 
 def choose_evenly(count: int, most: int) -> IntArray:
@@ -360,6 +361,16 @@ def compute_median(values: FloatArray) -> float:
     if np.isnan(ordered[-1]):
         return float("nan")
     return float(np.mean(ordered[(len(ordered) - 1) // 2 : len(ordered) // 2 + 1]))
+
+
+def compute_quantiles(values: FloatArray, shares: Sequence[float]) -> FloatArray:
+    """Return quantiles (q, ..) of values (n, ..) along the first axis, as `np.quantile`."""
+    ordered, place = np.sort(values, axis=0), np.asarray(shares) * (len(values) - 1)
+    low = np.floor(place).astype(np.int64)
+    below, above = ordered[low], ordered[np.minimum(low + 1, len(values) - 1)]
+    share = (place - low).reshape(-1, *(1,) * (values.ndim - 1))
+    step = above - below
+    return np.where(share < 0.5, below + step * share, above - step * (1.0 - share))
 
 
 def compute_known_median(values: FloatArray, axis: int) -> FloatArray:
