@@ -26,7 +26,7 @@ from loopcal.measure.observations import Observations
 Array = NDArray[np.float64]
 Values = dict[str, float]
 
-MACHINES, POSES, PREDICTED, SEED = 20, 30, 60, 5
+MACHINES, POSES, PREDICTED, SEED = 20, 30, 15, 5
 SIGMA = 0.1
 """Noise of u and v [px]."""
 

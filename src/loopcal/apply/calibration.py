@@ -44,6 +44,7 @@ from loopcal.diagnose.frame_drift import compare_shapes, report_base_targets
 from loopcal.diagnose.gauge_freedoms import interpret_fit
 from loopcal.diagnose.model_discrepancy import find_dense_regions
 from loopcal.diagnose.outliers import find_outliers
+from loopcal.diagnose.picture_errors import find_print_scale, measure_picture_errors
 from loopcal.diagnose.residual_patterns import CAUSE, POSE
 from loopcal.engine import collect_versions
 from loopcal.errors import DataError, EstimationError
@@ -204,13 +205,18 @@ def _explain_residuals(
     includes errors of drives or poses where these cause them, else as they are; how a fit of these
     data states the causes; and the linearized fit. `slow_p_value` : see `adjust_uncertainty`.
     """
-    linear, drives, explained = None, None, None
+    linear, drives, explained, pictures = None, None, None, list[Finding]()
     if is_explainable(fit):
         linear = linearize_fit(fit, split.fitted)
         explained = explain_residuals(linear)
         drives = measure_drive_errors(linear, explained)
+        pictures = [
+            *measure_picture_errors(linear, explained),
+            *find_print_scale(fit, split.fitted),
+        ]
+        fit = replace(fit, findings=(*fit.findings, *pictures))
     fit = adjust_uncertainty(fit, split.fitted, linear, explained, slow_p_value)
-    findings = [f for f in fit.findings if f.code == CAUSE]
+    findings = [*(f for f in fit.findings if f.code == CAUSE), *pictures]
     for found in [f for f in fit.findings if f.code == SHARED and f.data["cause"] == POSE]:
         findings.append(found)
         split = split.change(partial(add_shared_errors, finding=found))

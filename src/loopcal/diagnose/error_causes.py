@@ -21,6 +21,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from loopcal.diagnose.drive_errors import can_show_drives, list_drive_effects
+from loopcal.diagnose.picture_errors import ZOOMED, list_picture_effects
 from loopcal.diagnose.residual_patterns import (
     Cause,
     Effect,
@@ -83,6 +84,7 @@ def explain_residuals(linear: FitLinearization, *, is_doubted: bool = False) -> 
     effects = list_all(few)
     if can_show_drives(linear, rows):
         effects += list_drive_effects(linear, few)[:2]
+    effects += list_picture_effects(linear, few)
     located = few.locate_poses(data)
     causes = compare_causes(few.remainder, effects, located, known, is_doubted=is_doubted)
     doubt = fit.residual_test.exact_p_value
@@ -145,6 +147,8 @@ def compare_causes(
         spectrum, size = spectra[best - 3], sizes[best - 3]
         p_value = compute_any_probability(spectrum.compute_tail(known), len(effects))
         causes.append(Cause(first, effect.name, *stated, effect, size, p_value))
+        if first == ZOOMED:  # it has pulled the fit, too
+            break
         remainder = remainder.add(spectrum, size.ratio)
     return tuple(causes)
 

@@ -20,6 +20,7 @@ from loopcal.diagnose.error_frames import (
 )
 from loopcal.diagnose.model_discrepancy import LackOfFit, check_lack_of_fit
 from loopcal.diagnose.outliers import OutlierCheck, find_outliers
+from loopcal.diagnose.picture_errors import ZOOMED, find_swapped_pictures, measure_picture_errors
 from loopcal.diagnose.residual_patterns import CAUSE
 from loopcal.diagnose.value_comparison import compare_with_truth
 from loopcal.errors import EstimationError
@@ -220,6 +221,7 @@ def examine_fit(
     linear : the linearized fit, see `linearize_fit`.
     """
     outliers, causes = find_outliers(fit, data, progress=progress), ()
+    sizes: list[Finding] = []
     progress(0, 1, "testing for heavy tails")
     if fit.converged and fit.residual_test.intervals:
         linear = linearize_fit(fit, data, linear)
@@ -227,9 +229,12 @@ def examine_fit(
     if outliers.suspects and not known and linear is not None:
         explained = explain_residuals(linear, is_doubted=True)
         causes = tuple(cause.finding for cause in explained.causes)
+        sizes = measure_picture_errors(linear, explained)
     found = [f.data["cause"] for f in (*known, *causes)]
+    if OUTLIERS in found:
+        sizes = find_swapped_pictures(fit, data, outliers.suspects)
     shown = outliers
-    if outliers.suspects and found and OUTLIERS not in found:
+    if outliers.suspects and found and {OUTLIERS, ZOOMED}.isdisjoint(found):
         name = next(f.data["name"] for f in (*known, *causes))
         explained = report_finding(
             "outliers.explained", poses=outliers.suspects, cause=found[0], name=name
@@ -241,7 +246,7 @@ def examine_fit(
         find_correlated_groups(fit),
         estimate_calibration_gain(fit, data, frame),
         check_heavy_tails(fit, data, outliers.suspects, linear),
-        causes,
+        (*causes, *sizes),
     )
 
 

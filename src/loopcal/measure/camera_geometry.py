@@ -224,7 +224,7 @@ def calibrate_camera(
         if focal is None:
             raise DataError(
                 "the pictures do not determine the focal length. Tilt the board by 30 deg in some, "
-                "or state the focal length"
+                "or give the focal length"
             )
         lens = np.concatenate([focal, lens[2:]])
     poses = locate_boards(points, pixels, lens)

@@ -248,12 +248,15 @@ CAUSES = {
     "rough": "an error of each pose that its repeats share",
     "drives": "errors of the drives at single poses",
     "backlash": "backlash",
+    "moved-board": "a board that moved",
+    "zoomed-picture": "a picture with another focal length",
 }
 """What may cause residuals."""
 
 NAMED_CAUSES = {
     "temperature": "the temperature {name}",
     "reading": "a dependence on the reading {name}",
+    "zoomed-picture": "the picture of pose {name}, which has another focal length",
 }
 """Those of them of which a finding states the name."""
 

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import ClassVar, Self
 
@@ -12,6 +11,7 @@ import numpy as np
 
 from loopcal import geometry
 from loopcal.errors import DataError
+from loopcal.frozen_dataclass import dataclass, replace
 from loopcal.geometry import align_point_sets, solve_frame_and_points, solve_hand_eye
 from loopcal.measure.array_checks import check_pose, set_fields
 from loopcal.measure.camera_geometry import (
@@ -254,8 +254,10 @@ class Image(Kind):
         shapes, flat = np.stack([h * h, k * k, h * k], axis=-1), place * self.square
         scale, bend = (self.stated_or_unknown(values, name) for name in ("print", "bend"))
         height = (shapes * bend).sum(axis=-1, keepdims=True)
-        scaled = np.broadcast_to(flat * (1.0 + scale), (*height.shape[:-1], 2))
-        return np.concatenate([scaled, height], axis=-1), flat, shapes
+        scaled = flat * (1.0 + scale)
+        lead = np.broadcast_shapes(scaled.shape[:-1], height.shape[:-1])
+        parts = [np.broadcast_to(part, (*lead, part.shape[-1])) for part in (scaled, height)]
+        return np.concatenate(parts, axis=-1), flat, shapes
 
     @cached_property
     def _stated_points(self) -> FloatArray:

@@ -1,0 +1,129 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Mistakes with pictures of a printed board are named as the cause of residuals."""
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+
+from loopcal import geometry, identify, load_robot
+from loopcal.diagnose.error_causes import explain_residuals
+from loopcal.diagnose.picture_errors import (
+    find_print_scale,
+    find_swapped_pictures,
+    measure_picture_errors,
+)
+from loopcal.estimate.fit_linearization import linearize_fit
+from loopcal.frozen_dataclass import replace
+from loopcal.measure.instrument import Gaussian, Instrument, Sensor
+from loopcal.measure.kinds.image import Image
+from loopcal.measure.simulation import sample_truth, simulate_trials
+
+SIGMA = 0.1  # [px]
+
+
+@cache
+def measure():
+    """Return a hexapod with errors of its tolerances, and 16 pictures of its board."""
+    robot = load_robot("hexapod-42")
+    half, middle = np.array([30, 30, 15, 10, 10, 10]), np.array([0, 0, 200, 0, 0, 0])
+    poses = middle + np.random.default_rng(3).uniform(-half, half, (16, 6))
+    poses = poses * np.repeat([1e-3, np.pi / 180], 3)
+    kind = Image(
+        T_camera=geometry.make_pose(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.7])),
+        T_board=geometry.make_pose(np.diag([1.0, -1.0, -1.0]), np.array([-0.04, 0.03, 0.01])),
+        focal=(4000.0, 4000.0),
+        corners=(5, 4),
+        square=0.02,
+        unknown=("camera", "board", "focal", "center"),
+    )
+    instrument = Instrument((Sensor(kind, Gaussian(np.full(2, SIGMA))),))
+    trials = simulate_trials(robot, sample_truth(robot, 1, 4), poses, instrument, 5)
+    return robot, trials.trial(0), trials.T[0]
+
+
+def change(edit) -> Any:
+    """Return robot and data whose measured columns an `edit` changed."""
+    robot, data, T = measure()
+    rows = data.observations[0]
+    return robot, replace(data, observations=(edit(rows, T),))
+
+
+def explain(robot, data):
+    """Return the causes of the residuals of a fit, and the sizes of errors of pictures."""
+    fit = identify(robot, data)
+    linear = linearize_fit(fit, data, None)
+    explained = explain_residuals(linear, is_doubted=True)
+    return explained.causes, measure_picture_errors(linear, explained)
+
+
+def zoom(rows, _, factor=1.01):
+    measured, middle = np.array(rows.measured), np.array([1999.5, 1499.5])
+    own = rows.rows == 6
+    measured[own, 1:] = factor * (measured[own, 1:] - middle) + middle
+    return replace(rows, measured=measured)
+
+
+def move_board(rows, T):
+    """Move the board on the platform by 0.3 mm before pose 10."""
+    other = replace(rows.kind, unknown=("board",))
+    zero = np.zeros((1, len(rows), 2))
+    shift = np.array([0.001, 0.0, 0.0, 0.0003, 0.0, 0.0])
+    before, after = (
+        other.measure(T[None, rows.rows], zero, (other.nominal_values + d)[None, None])
+        for d in (np.zeros(6), shift)
+    )
+    later = (rows.rows >= 9)[:, None]
+    return replace(rows, measured=rows.measured + later * (after - before)[0])
+
+
+def shrink_print(rows, _):
+    """State squares that are larger than the printed ones."""
+    return replace(rows, kind=replace(rows.kind, square=0.02 / 0.97))
+
+
+@pytest.mark.slow
+def test_picture_with_another_focal_length_is_named_with_its_zoom() -> None:
+    causes, sizes = explain(*change(zoom))
+    assert (causes[0].source, causes[0].name) == ("zoomed-picture", "7")
+    assert sizes[0].code == "residuals.zoomed-picture"
+    assert sizes[0].data["zoom"] == pytest.approx(1.0, abs=0.05)  # [%]
+
+
+@pytest.mark.slow
+def test_board_that_moved_is_named_with_the_first_picture_after() -> None:
+    causes, sizes = explain(*change(move_board))
+    assert causes[0].source == "moved-board"
+    assert causes[0].name == "board, 10"
+    assert sizes[0].code == "residuals.board-moved"
+    assert sizes[0].data["shift"].value == pytest.approx(0.3, rel=0.2)  # [mm]
+
+
+@pytest.mark.slow
+def test_board_printed_to_fit_the_page_is_named_with_its_scale() -> None:
+    robot, data = change(shrink_print)
+    (found,) = find_print_scale(identify(robot, data), data)
+    assert (found.data["scale_x"], found.data["scale_y"]) == pytest.approx((97.0, 97.0), abs=0.3)
+    assert find_print_scale(identify(robot, measure()[1]), measure()[1]) == []
+
+
+@pytest.mark.slow
+def test_swapped_pictures_are_named_with_the_poses_that_they_show() -> None:
+    def swap(rows, _):
+        place = np.arange(16)
+        place[[4, 11]] = 11, 4
+        return replace(rows, rows=place[rows.rows])
+
+    robot, data = change(swap)
+    found = find_swapped_pictures(identify(robot, data), data, ("5", "12"))
+    assert [(f.data["pose"], f.data["shown"]) for f in found] == [("5", "12"), ("12", "5")]
+    assert find_swapped_pictures(identify(robot, measure()[1]), measure()[1], ("5",)) == []
+
+
+@pytest.mark.slow
+def test_good_pictures_have_no_cause() -> None:
+    robot, data, _ = measure()
+    fit = identify(robot, data)
+    explained = explain_residuals(linearize_fit(fit, data, None))
+    assert not explained.causes
