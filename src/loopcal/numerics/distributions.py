@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import lru_cache
 from importlib import import_module
 
 import numpy as np
@@ -160,14 +161,14 @@ def _find_quantile(split: Callable[[float], Shares], u: float, above: float) -> 
     return u
 
 
-def _find_f_quantile(degrees: float, left: float, above: float) -> float:
-    """Return the value of F that is exceeded with a probability."""
+def _find_f_quantile(degrees: float, left: float, above: float, near: float = 1.0) -> float:
+    """Return the value of F that is exceeded with a probability; near : a guess of it."""
     a, b = 0.5 * degrees, 0.5 * left
 
     def split(u: float) -> Shares:
         return _split_beta(a, b, 1.0 / (1.0 + math.exp(-u)), 1.0 / (1.0 + math.exp(u)))
 
-    return left / degrees * math.exp(_find_quantile(split, math.log(a / b), above))
+    return left / degrees * math.exp(_find_quantile(split, math.log(near * a / b), above))
 
 
 def _find_chi_square_quantile(degrees: float, above: float) -> float:
@@ -178,17 +179,22 @@ def _find_chi_square_quantile(degrees: float, above: float) -> float:
     )
 
 
-def _find_student_quantile(degrees: float, probability: float) -> float:
-    """Return the t that is not exceeded with a probability; its square has an F distribution."""
-    outside = 2.0 * min(probability, 1.0 - probability)
-    size = 0.0 if outside == 1.0 else math.sqrt(_find_f_quantile(1.0, degrees, outside))
-    return math.copysign(size, probability - 0.5)
-
-
+@lru_cache(maxsize=4096)
 def _find_normal_quantile(probability: float) -> float:
     """Return the standard normal value that is not exceeded with a probability."""
     outside = 2.0 * min(probability, 1.0 - probability)
     size = 0.0 if outside == 1.0 else math.sqrt(_find_chi_square_quantile(1.0, outside))
+    return math.copysign(size, probability - 0.5)
+
+
+@lru_cache(maxsize=4096)  # parameters have intervals of one level in several tables
+def _find_student_quantile(degrees: float, probability: float) -> float:
+    """Return the t that is not exceeded with a probability; its square has an F distribution."""
+    outside, z = 2.0 * min(probability, 1.0 - probability), _find_normal_quantile(probability)
+    if not 0.0 < outside < 1.0:
+        return z
+    near = z * z * (1.0 + (z * z + 1.0) / (2.0 * degrees))  # the first term of Cornish and Fisher
+    size = math.sqrt(_find_f_quantile(1.0, degrees, outside, near))
     return math.copysign(size, probability - 0.5)
 
 
