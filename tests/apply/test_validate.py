@@ -17,7 +17,6 @@ from loopcal.io.core.text_file import to_json
 from loopcal.io.robot.robot_file import load_robot
 from loopcal.measure.instrument import Gaussian, Instrument, Sensor
 from loopcal.measure.kinds import KINDS
-from loopcal.measure.kinds.kind import list_error_groups
 from loopcal.measure.kinds.poses import Pose
 from loopcal.measure.kinds.position import Position
 from loopcal.measure.observations import Observations
@@ -116,7 +115,7 @@ def test_one_entry_adds_a_metric_to_results_json_and_tables(validation, monkeypa
 @pytest.mark.parametrize("kind_class", KINDS.values(), ids=list(KINDS))
 def test_every_residual_of_a_kind_belongs_to_one_error(kind_class):
     for kind in kind_class.examples():
-        groups = list_error_groups(kind)
+        groups = kind.error_groups
         columns = [i for group in groups for i in group.columns]
         assert sorted(columns) == list(range(len(kind.noise_columns)))
         assert all(len(group.columns) <= 3 for group in groups)

@@ -36,7 +36,6 @@ from loopcal.diagnose.row_errors import PoseErrors
 from loopcal.errors import EstimationError
 from loopcal.findings import Finding, Quantity, report_finding
 from loopcal.frozen_dataclass import dataclass
-from loopcal.measure.kinds.kind import list_error_groups
 from loopcal.measure.observations import Observations
 from loopcal.numerics.statistics import (
     compute_chi_square_quantile,
@@ -364,7 +363,7 @@ def _collect_covariance(observations: Sequence[Observations], quantity: str) -> 
     """
     covariances = [np.zeros((0, 3, 3))]
     for o in observations:
-        for group in (g for g in list_error_groups(o.kind) if g.quantity == quantity):
+        for group in (g for g in o.kind.error_groups if g.quantity == quantity):
             columns = np.array(group.columns)
             measured = o.present[:, columns].any(axis=1)
             if o.is_noise_assumed and measured.any():

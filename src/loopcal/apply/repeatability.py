@@ -32,7 +32,7 @@ from loopcal.findings import Finding, report_finding
 from loopcal.findings.wording import round_to_digits
 from loopcal.frozen_dataclass import dataclass, replace
 from loopcal.measure.data_checks import check_actuators
-from loopcal.measure.kinds.kind import ErrorGroup, list_error_groups
+from loopcal.measure.kinds.kind import ErrorGroup
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations
 from loopcal.measure.repeats import find_reading_tolerance, find_repeats
@@ -206,7 +206,7 @@ def assess_repeatability(
         o
         for o in data.observations
         if o.kind.poses_per_row == 1
-        and {g.quantity for g in list_error_groups(o.kind)} & DIMENSIONS.keys()
+        and {g.quantity for g in o.kind.error_groups} & DIMENSIONS.keys()
     )
     if not kept:
         raise DataError(report_finding("repeatability.nothing-measured"))
@@ -222,7 +222,7 @@ def assess_repeatability(
     poses: dict[str, list[VisitedPose]] = {quantity: [] for quantity in DIMENSIONS}
     variations: dict[tuple[str, str], float] = {}
     for o, residual in zip(rows, residuals, strict=True):
-        for group in list_error_groups(o.kind):
+        for group in o.kind.error_groups:
             if group.quantity in DIMENSIONS:
                 visited = _describe_poses(o, residual, group, compared.data)
                 poses[group.quantity] += visited

@@ -59,7 +59,6 @@ from loopcal.estimate.residual_test import choose_severity
 from loopcal.estimate.result import Identification, add_covariance
 from loopcal.findings import Finding, Quantity, Severity, report_finding
 from loopcal.frozen_dataclass import dataclass, replace
-from loopcal.measure.kinds.kind import list_components
 from loopcal.measure.measurements import Measurements
 from loopcal.numerics.statistics import choose_evenly, compute_median, find_distinct
 from loopcal.typing import BoolArray, FloatArray
@@ -210,7 +209,7 @@ def add_shared_errors(data: Measurements, finding: Finding) -> Measurements:
     rows = []
     for o in data.observations:
         covariance = o.covariance.copy()
-        for (name, _), columns in list_components(o.kind).items():
+        for (name, _), columns in o.kind.component_columns.items():
             covariance[:, np.array(columns)[:, None], columns] += sizes.get(name, 0.0) ** 2
         rows.append(replace(o, covariance=covariance))
     return replace(data, observations=tuple(rows))

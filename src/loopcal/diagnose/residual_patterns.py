@@ -29,7 +29,7 @@ from loopcal.estimate.linearization import Linearization, PoseSolution
 from loopcal.estimate.problem import Problem
 from loopcal.findings import Finding, Severity, report_finding
 from loopcal.frozen_dataclass import dataclass, replace
-from loopcal.measure.kinds.kind import Kind, list_components
+from loopcal.measure.kinds.kind import Kind
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations
 from loopcal.mechanism.model import Mechanism
@@ -305,14 +305,12 @@ class Effect:
         """(c,) sizes [SI], equal for equal labels, that add the variance 1 to the rows that they
         change.
         """
-        columns = self.acting
-        unit = np.ones(columns.shape[1])
-        for label in set(self.labels):
-            own = np.array([each == label for each in self.labels])
-            square = (columns[:, own] ** 2).sum(axis=1)
-            if square.any():
-                unit[own] = 1.0 / np.sqrt(square[square > 0.0].mean())
-        return unit
+        names = list(dict.fromkeys(self.labels))
+        number = np.array([names.index(label) for label in self.labels], dtype=np.int64)
+        squares = self.acting**2 @ (number[:, None] == np.arange(len(names)))
+        changed = (squares > 0.0).sum(axis=0)
+        mean = np.where(changed > 0, squares.sum(axis=0) / np.maximum(changed, 1), 1.0)
+        return 1.0 / np.sqrt(mean[number])
 
     @cached_property
     def scaled(self) -> FloatArray:
@@ -375,7 +373,7 @@ def list_effects(rows: ResidualRows, data: Measurements, robot: Mechanism) -> tu
     is_finer = blocks > len({session for o in observations for session in o.session.tolist()})
     if is_finer and 2 * blocks <= data.n_poses:
         listed.append((BLOCK, "", [indicate_groups(data.block[i]) for i in poses]))
-    members = [columns for o in observations for columns in list_components(o.kind).values()]
+    members = [columns for o in observations for columns in o.kind.component_columns.values()]
     if max(map(len, members)) > 1:
         chosen = choose_evenly(data.n_poses, MOST_POSES)
         listed.append((POSE, "", [(i[:, None] == chosen).astype(float) for i in poses]))
@@ -422,7 +420,7 @@ def list_shared_errors(
 
 def _label_columns(kind: Kind) -> list[tuple[str, Dimension]]:
     """Return the component and dimension of each noise column of a kind."""
-    named = {i: label for label, columns in list_components(kind).items() for i in columns}
+    named = {i: label for label, columns in kind.component_columns.items() for i in columns}
     return [named[i] for i in sorted(named)]
 
 
@@ -437,7 +435,7 @@ def build_effect(
     for number, (o, of_kind) in enumerate(zip(observations, functions, strict=True)):
         chosen = np.flatnonzero(rows.kind == number)
         whitener, row = o.whitener[rows.row[chosen], rows.column[chosen]], rows.row[chosen]
-        for label, members in list_components(o.kind).items():
+        for label, members in o.kind.component_columns.items():
             shift = -whitener[:, members].sum(axis=1)[:, None]
             both = np.zeros((2, len(rows.residual), of_kind.shape[1]))
             both[0, chosen] = shift * (of_kind - of_kind.mean(axis=0))[row]

@@ -4,7 +4,7 @@
 An error is the difference of one target (or of the tool) between prediction and measurement: its
 size is the root of the sum of squares of the measured components [m] or [rad], its balance their
 largest minus their smallest. A row with three targets has three position errors; statistics run
-over rows x targets. Which residuals belong together is what `list_error_groups` says.
+over rows x targets. Which residuals belong together is what `error_groups` of a kind says.
 
 Kinds of measurement are compared in units of their sigma: the root mean square of W r over all
 measured components, r the residuals and W the inverse Cholesky factor of their covariance, so that
@@ -28,7 +28,6 @@ from loopcal.estimate.smooth_errors import SmoothErrors
 from loopcal.findings import report_finding
 from loopcal.frozen_dataclass import dataclass, field, replace
 from loopcal.measure.initial_values import guess_nuisance_values
-from loopcal.measure.kinds.kind import list_error_groups
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.nuisance import NuisanceParameters
 from loopcal.measure.observations import Observations
@@ -314,7 +313,7 @@ def compute_row_errors(
     errors_by_quantity: dict[str, list[QuantityErrors]] = {}
     for o, residual in zip(observations, residuals, strict=True):
         shown = np.where(o.present, residual, np.nan)
-        for group in list_error_groups(o.kind):
+        for group in o.kind.error_groups:
             components = np.full((len(o), MOST_COMPONENTS), np.nan)
             components[:, : len(group.columns)] = shown[:, list(group.columns)]
             measured = np.isfinite(components).any(axis=1)

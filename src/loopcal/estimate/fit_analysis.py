@@ -62,7 +62,6 @@ from loopcal.estimate.result import (
 from loopcal.estimate.unfixed_motions import FrameRows, UnfixedMotions, describe_frames
 from loopcal.findings import Finding, report_finding
 from loopcal.measure.fitted_rows import FittedRows, collect_fitted_rows
-from loopcal.measure.kinds.kind import list_error_groups
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.nuisance import NuisanceParameters
 from loopcal.mechanism.compilation import find_impossible_values
@@ -413,7 +412,7 @@ def _list_sigmas(data: Measurements, robot: Mechanism, scale: float) -> list[dic
     sigmas: dict[tuple[str, str], dict[str, Any]] = {}
     for rows in (o for o in data.observations if o.is_noise_assumed and len(o)):
         variance = np.diagonal(rows.covariance, axis1=1, axis2=2)
-        for group in list_error_groups(rows.kind):
+        for group in rows.kind.error_groups:
             sigma = float(np.sqrt(np.median(variance[:, list(group.columns)])))
             values = (robot.to_quantity(value, group.dimension) for value in (sigma, scale * sigma))
             assumed, estimated = values

@@ -635,14 +635,14 @@ def read_shared_errors(
     that an MPE states, and the priors, of 0 where a component has no such error. FileError : an
     unknown component or key, or no number.
     """
-    from loopcal.measure.kinds.kind import list_components, name_shared_error
+    from loopcal.measure.kinds.kind import name_shared_error
     from loopcal.measure.nuisance import StatedValue
 
     noise: dict[str, StatedSd] = {}
     priors: dict[str, StatedValue] = {}
     for key in (key for key in SHARED_ERRORS if key in node):
         place, stated = (*location, key), node[key]
-        components = dict(list_components(kind).keys())
+        components = dict(kind.component_columns.keys())
         measured = set(components.values())
         if not measured or (key in SCALED and Dimension.LENGTH not in measured):
             what = "lengths" if key in SCALED else "values"

@@ -128,41 +128,6 @@ def is_incomplete(columns: FloatArray) -> BoolArray:
     return np.any(missing, axis=-1) & ~np.all(missing, axis=-1)
 
 
-def list_error_groups(kind: Kind) -> tuple[ErrorGroup, ...]:
-    """Return the errors that the residuals of one row of a kind are."""
-    residuals = kind.noise_columns
-    targets: Mapping[str, tuple[int, ...]] = {"": tuple(range(len(residuals)))}
-    if kind.sensed_joints and not kind.of:
-        targets = {name: (i,) for i, name in enumerate(kind.sensed_joints)}
-    elif residuals == kind.columns:
-        targets = kind.target_columns
-    quantities = {
-        Dimension.LENGTH: kind.length_error,
-        Dimension.ANGLE: kind.angle_error,
-        Dimension.PIXEL: "image",
-    }
-    groups = []
-    for target, places in targets.items():
-        for dimension, quantity in quantities.items():
-            columns = tuple(i for i in places if residuals[i].dimension is dimension)
-            names = tuple(residuals[i].name.removeprefix(f"{target}.") for i in columns)
-            if columns:
-                label = target if len(targets) > 1 else ""
-                groups.append(ErrorGroup(quantity, dimension, label, names, columns))
-    return tuple(groups)
-
-
-def list_components(kind: Kind) -> dict[tuple[str, Dimension], list[int]]:
-    """Return the measured components of a kind with the indices of their noise columns: x of all
-    targets is one component.
-    """
-    members: dict[tuple[str, Dimension], list[int]] = {}
-    for group in list_error_groups(kind):
-        for name, column in zip(group.components, group.columns, strict=True):
-            members.setdefault((name, group.dimension), []).append(column)
-    return members
-
-
 def name_shared_error(kind: Kind, item: str, component: str) -> str:
     """Return the name of the bias or drift of a component, such as `tracker.bias.x`: with the name
     of the fixed point or frame where the settings state one, else that of the kind. That of a
@@ -379,11 +344,46 @@ class Kind(ABC):
         return tuple(name for name in SHARED_ERRORS if name in self.unknown)
 
     @cached_property
+    def error_groups(self) -> tuple[ErrorGroup, ...]:
+        """The errors that the residuals of one row are."""
+        residuals = self.noise_columns
+        targets: Mapping[str, tuple[int, ...]] = {"": tuple(range(len(residuals)))}
+        if self.sensed_joints and not self.of:
+            targets = {name: (i,) for i, name in enumerate(self.sensed_joints)}
+        elif residuals == self.columns:
+            targets = self.target_columns
+        quantities = {
+            Dimension.LENGTH: self.length_error,
+            Dimension.ANGLE: self.angle_error,
+            Dimension.PIXEL: "image",
+        }
+        groups = []
+        for target, places in targets.items():
+            for dimension, quantity in quantities.items():
+                columns = tuple(i for i in places if residuals[i].dimension is dimension)
+                names = tuple(residuals[i].name.removeprefix(f"{target}.") for i in columns)
+                if columns:
+                    label = target if len(targets) > 1 else ""
+                    groups.append(ErrorGroup(quantity, dimension, label, names, columns))
+        return tuple(groups)
+
+    @cached_property
+    def component_columns(self) -> Mapping[tuple[str, Dimension], list[int]]:
+        """The measured components with the indices of their noise columns: x of all targets is one
+        component.
+        """
+        members: dict[tuple[str, Dimension], list[int]] = {}
+        for group in self.error_groups:
+            for name, column in zip(group.components, group.columns, strict=True):
+                members.setdefault((name, group.dimension), []).append(column)
+        return members
+
+    @cached_property
     def setup_items(self) -> Mapping[str, SetupItem]:
         """The unknown setup items in order, shared errors last: a parameter for each component."""
         items = dict(self.own_items)
         for item in self.shared_errors:
-            components = list_components(self)
+            components = self.component_columns
             of_item = [("", Dimension.RATIO)] if item in SCALES else list(components)
             named = [(name_shared_error(self, item, name), d) for name, d in of_item]
             shared = (Parameter(name, d, 0.0, scope="session") for name, d in named)
@@ -424,7 +424,7 @@ class Kind(ABC):
     @cached_property
     def _spread(self) -> FloatArray:
         """The matrix (m, b) that adds a shared error of each component to its noise columns."""
-        components = list_components(self).values()
+        components = self.component_columns.values()
         matrix = np.zeros((len(self.noise_columns), len(components)))
         for i, columns in enumerate(components):
             matrix[columns, i] = 1.0
