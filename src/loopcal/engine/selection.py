@@ -184,7 +184,8 @@ def solve(
     start : first guess, (t | 1, n | 1) rows.
     task : conditions on the pose, as many as the freed actuators leave open.
     free : solve for the actuated joints too.
-    sums : solve for the actuated joints too, of which these sums are given.
+    sums : solve for the actuated joints too, of which these sums are given; they begin at the
+        start, and q is not read.
     goal : solutions (t, n); a row ends as NEAR_GOAL as soon as its next step leads close to its
         goal, to which further steps would converge. Its coordinates are those before that step.
 
@@ -193,6 +194,7 @@ def solve(
     """
     current = _get_engine_for(program, sums)
     given = () if sums is None else (sums,)
+    q = q if sums is None else program.list_drives(start.joints)
     state = current.solve(program, e, q, start, task, free, max_iterations, goal, *given)
     if not program.idle_groups:
         return state
@@ -213,8 +215,8 @@ def follow(
 ) -> State:
     """Solve the poses of each trial one after the other, each from the solution of the one before.
 
-    Arguments are those of `solve`, start : (t | 1, 1); with `sums`, q is not read. With `ends`, a
-    trial ends at its first pose that does not converge; the others get its status, and no meaning.
+    Arguments are those of `solve`, start : (t | 1, 1). With `ends`, a trial ends at its first pose
+    that does not converge; the others get its status, and no meaning.
     """
     own = _get_engine_for(program, sums).follow
     if own is None or program.idle_groups:

@@ -197,23 +197,6 @@ def scale_sums(program: Program, weights: FloatArray, sums: FloatArray) -> engin
     return engine.Sums(weights * units[:, None], sums * units)
 
 
-def solve_open_sums(
-    program: Program,
-    e: FloatArray,
-    weights: FloatArray,
-    sums: FloatArray,
-    begin: State,
-    max_iterations: int = ITERATIONS,
-    task: engine.Task | None = None,
-) -> State:
-    """Return the states (t, n) at which the weighted sums (t | 1, n, r) of driven joints are given,
-    and the conditions of a task, by Newton's method from `begin` (t | 1, n | 1).
-    """
-    own = scale_sums(program, weights, sums)
-    q = program.list_drives(begin.joints)
-    return engine.solve(program, e, q, begin, task, False, max_iterations, sums=own)
-
-
 def stack_sum_rows(
     program: Program, blocks: engine.ClosureBlocks, weights: FloatArray
 ) -> FloatArray:

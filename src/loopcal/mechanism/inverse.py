@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from loopcal import engine, geometry
 from loopcal.engine import BASE, CONVERGED, EXHAUSTED, NOT_FINITE, PITCH, PLATFORM, STALLED, State
 from loopcal.frozen_dataclass import dataclass, replace
-from loopcal.mechanism.actuation import OpenSums, list_open_sums, solve_open_sums
+from loopcal.mechanism.actuation import OpenSums, list_open_sums, scale_sums
 from loopcal.mechanism.chains import (
     find_carrying_actuators,
     has_spare_drives,
@@ -117,8 +117,9 @@ def _close_with_free_actuators(
     begin = replace(begin, T=T)
     if robot.assembly.couplings:
         sums = list_open_sums(robot, values)
-        own = sums.weights[:, sums.chosen :], sums.fixed
-        return solve_open_sums(robot.program, e, *own, begin, max_iterations, command)
+        own = scale_sums(robot.program, sums.weights[:, sums.chosen :], sums.fixed)
+        given = begin, command, False, max_iterations
+        return engine.solve(robot.program, e, guess, *given, sums=own)
     guess = np.broadcast_to(guess, (t, n, robot.program.n_joints))
     return engine.solve(robot.program, e, guess, begin, command, True, max_iterations)
 

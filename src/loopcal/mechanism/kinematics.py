@@ -17,13 +17,7 @@ from numpy.typing import NDArray
 from loopcal import engine, geometry
 from loopcal.engine import State
 from loopcal.frozen_dataclass import dataclass, replace
-from loopcal.mechanism.actuation import (
-    ITERATIONS,
-    DrivenJoints,
-    drive_joints,
-    scale_sums,
-    solve_open_sums,
-)
+from loopcal.mechanism.actuation import ITERATIONS, DrivenJoints, drive_joints, scale_sums
 from loopcal.mechanism.chains import ChainState, each_stage, join_stage_states, locate_stage_bases
 from loopcal.mechanism.limb_rows import follow_limb
 from loopcal.mechanism.model import Mechanism
@@ -118,22 +112,21 @@ class Loops(NamedTuple):
         max_iterations: int = ITERATIONS,
     ) -> State:
         """Return states (t, n) at joint values or sums (t | 1, n, a)."""
-        program, e = self.robot.program, self.e
-        if self.weights is not None:
-            state = solve_open_sums(program, e, self.weights, values, begin, max_iterations)
-        else:
-            state = engine.solve(program, e, values, begin, None, False, max_iterations, goal)
-        return clear_sign(self.robot, state)
+        given = values, begin, None, False, max_iterations, goal, self.state_sums(values)
+        return clear_sign(self.robot, engine.solve(self.robot.program, self.e, *given))
 
     def follow(self, values: FloatArray, begin: State, ends: bool) -> State:
         """Return states (t, n) at joint values or sums (t, n, a) one after the other, from `begin`
         (t, 1); see `engine.follow`.
         """
-        sums = (
-            None if self.weights is None else scale_sums(self.robot.program, self.weights, values)
-        )
-        state = engine.follow(self.robot.program, self.e, values, begin, ends, ITERATIONS, sums)
-        return clear_sign(self.robot, state)
+        given = values, begin, ends, ITERATIONS, self.state_sums(values)
+        return clear_sign(self.robot, engine.follow(self.robot.program, self.e, *given))
+
+    def state_sums(self, values: FloatArray) -> engine.Sums | None:
+        """Return values (t | 1, n, a) as sums of driven joints, None where they are joints."""
+        if self.weights is None:
+            return None
+        return scale_sums(self.robot.program, self.weights, values)
 
     def read(self, state: State) -> FloatArray:
         """Return the joint values or sums (t, n, a) of a state."""
