@@ -176,3 +176,29 @@ def test_decision_and_budget_are_drawn_for_pages() -> None:
     budget = {"position": {"rms": 2e-6}, "orientation": {"rms": 0.0}, "sources": [line]}
     shown = read_texts(for_page(draw_budget_sources, {**budget, "over": "workspace", "poses": 9}))
     assert {"instrument", "position: 2 um in all"} <= shown
+
+
+def test_what_has_no_number_is_left_out() -> None:
+    nothing, holes = np.zeros(0), np.array([np.nan, 1.0, np.inf])
+    with drawing_for_page():
+        figure, ((empty, full),) = start_panels(6.0, 3.0, 1, 2)
+        empty.plot(nothing, nothing, "o")
+        empty.axhline(0.0)
+        scale_logarithmically(empty.yaxis)
+        full.plot(holes, holes, "o-", color="#123456")
+        full.bar([0.0, 1.0], [np.nan, 2.0], color="#654321")
+        full.errorbar(holes[:2], [0.0, 1.0], xerr=holes[:2], fmt="s", color="#123456")
+        full.annotate("nowhere", (np.nan, 1.0))
+    svg = figure.write_svg("f")
+    ET.fromstring(svg)
+    assert re.search("nan|inf|nowhere", svg) is None
+    assert len(read_dots(svg, "#123456")) == 1
+    assert svg.count('fill="#654321"') == 1
+
+
+def test_many_markers_are_short() -> None:
+    x = np.random.default_rng(0).uniform(size=(2, 20_000))
+    with drawing_for_page():
+        figure, ((axes,),) = start_panels(6.0, 4.0, 1, 1)
+        axes.plot(*x, "^", color="#123456")
+    assert len(figure.write_svg("f")) < 20 * x.shape[1]
