@@ -62,10 +62,15 @@ def draw_sessions(robot: Mechanism, n: int, sessions: int, targets: int) -> Meas
     return simulate(truth, _targets(robot, n), Instrument((sensor,)), 0)
 
 
-def _growth(name: str, few: Callable[[], object], many: Callable[[], object]) -> Metric:
+def _growth(
+    name: str,
+    few: Callable[[], object],
+    many: Callable[[], object],
+    counts: tuple[int, int] = (FEW, MANY),
+) -> Metric:
     """The ratio of the shorter of two times each."""
     less, more = (min(time_once(work) for _ in range(2)) for work in (few, many))
-    note = f"{less:.3g} s and {more:.3g} s for {FEW} and {MANY}"
+    note = f"{less:.3g} s and {more:.3g} s for {counts[0]} and {counts[1]}"
     return Metric(name, more / less, tolerance=None, limit=LIMIT, note=note)
 
 
@@ -105,3 +110,19 @@ def bench_compensation() -> Metric:
     targets = [_targets(robot, n) for n in (FEW, MANY)]
     tasks = (lambda x=x: format_compensation(compensate(truth, x)) for x in targets)
     return _growth("growth.compensation_of_targets", *tasks)
+
+
+def bench_sessions() -> Metric:
+    """Calibrate with 100 sessions against 25, four poses of each, frame and targets unknown."""
+    robot, counts = load_robot("hexapod-42"), (25, 100)
+    data = [draw_sessions(robot, 4 * n, n, 3) for n in counts]
+    few, many = (lambda d=d: calibrate(robot, d) for d in data)
+    return _growth("growth.calibration_of_sessions", few, many, counts)
+
+
+def bench_targets() -> Metric:
+    """Calibrate with 48 unknown targets in an unknown frame against 12, 60 poses."""
+    robot, counts = load_robot("hexapod-42"), (12, 48)
+    data = [draw_sessions(robot, 60, 1, n) for n in counts]
+    few, many = (lambda d=d: calibrate(robot, d) for d in data)
+    return _growth("growth.calibration_of_targets", few, many, counts)

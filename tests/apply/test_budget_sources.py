@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import loopcal as lc
+from loopcal.apply import error_budget
 from loopcal.apply.accuracy import pose_uncertainty
 from loopcal.apply.error_budget import (
     ErrorBudget,
@@ -440,3 +441,23 @@ def test_sources_of_all_sessions_add_up_and_no_decomposition_grows_with_the_sess
         variance = np.diag(linear.variance[linear.is_estimated])
         assert np.allclose(sum(x @ x.T for x in parts), variance, rtol=0.0, atol=1e-9)
     assert max(sizes) == len(robot.parameters.names)
+
+
+def test_half_the_sigma_of_a_session_alone_is_that_of_all_rows_with_this_sigma(monkeypatch):
+    """The factor with the rows of the session added equals that of a problem with other weights."""
+    robot, n = lc.load_robot("hexapod-42"), 24
+    kind = Position(targets=("a", "b", "c"), places=PLACES, unknown=("frame", "targets"))
+    truth = robot.with_values(sample_truth(robot, 1, 0)[0])
+    day = np.array([f"day {i // 8}" for i in range(n)])
+    sensor = Sensor(kind, noise(*[10 * UM] * 9), session=day)
+    poses = sample_workspace(robot, n, 1).coordinates
+    data = simulate(truth, poses, Instrument((sensor,)), 1)
+    fit = identify(robot, data)
+    short = budget_of(fit, data)
+    monkeypatch.setattr(error_budget, "_find_rows_alone", lambda *_: None)
+    whole = budget_of(fit, data)
+    for a, b in zip(short.lines, whole.lines, strict=True):
+        if a.halved is not None and b.halved is not None:
+            assert a.halved.position == pytest.approx(b.halved.position, rel=1e-9)
+            assert a.halved.orientation == pytest.approx(b.halved.orientation, rel=1e-9)
+            assert np.allclose(a.halved.parameters, b.halved.parameters, rtol=1e-9)

@@ -130,6 +130,7 @@ class CovarianceSplit(NamedTuple):
     # (p,) parameters of infinite variance, of which the roots contain what the tolerances allow
     undetermined: BoolArray
     numbered: NumberedSources
+    factors: tuple[SourceFactor, ...]  # of the numbered sources
 
 
 def split_covariance(linear: FitLinearization) -> CovarianceSplit:
@@ -151,6 +152,7 @@ def split_covariance(linear: FitLinearization) -> CovarianceSplit:
 
     sources = [state(*key, size, evaluation, of_noise) for key, size in names.items()]
     factors = fold_sources(linear.problem, linear.linearization, members, len(names))
+    of_rows = tuple(factors)
     common, estimate = list_common_errors(linear.problem), linear.linearization.nuisance
     for (kind, name), rows in _list_further_rows(linear, common):
         size = _find_common_size(linear, common, name) if kind == COMMON else None
@@ -190,20 +192,29 @@ def split_covariance(linear: FitLinearization) -> CovarianceSplit:
         np.asarray(np.linalg.qr(x.T, mode="r")).T if x.shape[1] > len(x) else x for x in joined
     )
     roots = tuple(fit.tolerance[:, None] * root for root in short)
-    return CovarianceSplit(tuple(merged), roots, np.isinf(np.diag(fit.covariance)), numbered)
+    undetermined = np.isinf(np.diag(fit.covariance))
+    return CovarianceSplit(tuple(merged), roots, undetermined, numbered, of_rows)
 
 
 def _halve_sigma(
-    linear: FitLinearization, numbered: NumberedSources, source: Source
+    linear: FitLinearization, split: CovarianceSplit, source: Source, *, moves_frames: bool
 ) -> tuple[FloatArray, Linearization, Problem] | None:
     """Return a root (p, k) [SI] of the covariance without added parts if the sigma of a source of
     rows or of the tolerances were half as large, with its linearization; None for other sources.
 
     Every weight is that of the smaller sigma. Estimates stay, and so does a scale of the noise that
-    the residuals gave.
+    the residuals gave. Where all rows of a source are alone in their clusters of setup parameters,
+    these follow them as before, and only the factor of the machine changes; whether frames of
+    instruments are asked for, too, is `moves_frames`.
     """
     fit, problem, weight = linear.fit, linear.problem, 1.0
-    nuisance, (of_rows, members) = problem.nuisance, numbered
+    nuisance, (of_rows, members) = problem.nuisance, split.numbered
+    p, at = len(fit.names), linear.linearization
+    if not moves_frames and (rows := _find_rows_alone(problem, split, source)) is not None:
+        triangle = np.concatenate([at.factor[0, :p, :p], np.sqrt(3.0) * rows])
+        triangle = np.asarray(np.linalg.qr(triangle, mode="r"))
+        own = _propagate(linear, divide_by_cluster(0, triangle, p, None))
+        return fit.tolerance[:, None] * np.concatenate(own, axis=1), at, problem
     if source.kind == TOLERANCES:
         weight = 4.0
     elif (named := (source.kind, source.name)) in of_rows:
@@ -227,14 +238,32 @@ def _halve_sigma(
         problem = replace(problem, poses=poses)
     else:
         return None
-    at = linear.linearization
     linearization = problem.linearize(at.deviation, at.next_start)
     if fit.options.prior is not None:
         linearization = fit.options.prior.added(problem).append(linearization)
-    p = len(fit.names)
     factor = linearization.factor[0, :p, :p]
     own = _propagate(linear, divide_by_cluster(0, factor, p, None), weight)
     return fit.tolerance[:, None] * np.concatenate(own, axis=1), linearization, problem
+
+
+def _find_rows_alone(problem: Problem, split: CovarianceSplit, source: Source) -> FloatArray | None:
+    """Return the rows (m, p) of a source, setup parameters eliminated, if their setup parameters
+    have no prior and no rows of another source; None for others.
+    """
+    of_rows, members = split.numbered
+    named = source.kind, source.name
+    if named not in of_rows or problem.is_uncertain:
+        return None
+    number = list(of_rows).index(named)
+    shares = [root for parts in members for numbers, root in parts if (numbers == number).any()]
+    own = [factor for factor in split.factors if factor.source == number]
+    moved = {int(i) for factor in own for i in factor.unknowns}
+    others = (f.unknowns[:1].tolist() for f in split.factors if f.source != number)
+    is_shared = any(first and first[0] in moved for first in others)
+    has_prior = problem.nuisance is not None and problem.nuisance.has_prior[list(moved)].any()
+    if is_shared or has_prior or not own or any(root is not None for root in shares):
+        return None
+    return np.concatenate([factor.machine for factor in own])
 
 
 def _name(rows: Observations, session: str, data: Measurements) -> str:
@@ -608,7 +637,7 @@ def compute_error_budget(
     sd = np.sqrt(sum(line.parameters for line in lines))
     sd = np.where(split.undetermined, np.inf, sd)
     given = lines, solution, frame, effects
-    halved = [_halve(linear, split.numbered, each, *given) for each in lines]
+    halved = [_halve(linear, split, each, *given) for each in lines]
     lines = [replace(line, halved=of_line) for line, of_line in zip(lines, halved, strict=True)]
     position, orientation = _add_kinds(lines)
     n = len(solution.q)
@@ -657,7 +686,7 @@ def _list_sources(
 
 def _halve(
     linear: FitLinearization,
-    numbered: NumberedSources,
+    split: CovarianceSplit,
     line: SourceBudget,
     lines: list[SourceBudget],
     solution: Solution,
@@ -669,11 +698,12 @@ def _halve(
     position, orientation = (sum(getattr(each, name) for each in lines) for name in LENGTHS)
     parameters = sum(each.parameters for each in lines)
     if line.source.kind in OF_ROWS:
-        halved = _halve_sigma(linear, numbered, line.source)
+        moves_frames = frame not in (FITTED, BASE, RELATIVE)
+        halved = _halve_sigma(linear, split, line.source, moves_frames=moves_frames)
         if halved is None:
             return None
         root, linearization, problem = halved
-        if frame not in (FITTED, BASE, RELATIVE):
+        if moves_frames:
             frames = find_frame_knowledge(
                 problem,
                 linear.data,

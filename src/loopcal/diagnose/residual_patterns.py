@@ -113,8 +113,11 @@ class ResidualRows:
         )
 
     def take_poses(self, data: Measurements) -> ResidualRows:
-        """Return the rows as if the fit had only used an even choice of `MOST_POSES` poses."""
-        chosen = choose_evenly(data.n_poses, MOST_POSES)
+        """Return the rows as if the fit had only used an even choice of `MOST_POSES` poses, fewer
+        where their rows are more than `MOST_VALUES`.
+        """
+        most = int(MOST_VALUES * data.n_poses / max(len(self.residual), 1))
+        chosen = choose_evenly(data.n_poses, min(MOST_POSES, max(most, FEWEST_POSES)))
         if len(chosen) == data.n_poses:
             return self
         left = ~np.isin(self.locate_poses(data), chosen)
@@ -282,6 +285,7 @@ RANDOM = {SESSION, BLOCK, POSE, TARGET, WALK, SMOOTH, ROUGH}  # whose sizes are 
 CAUSE = "residuals.cause"  # code of the finding on the cause of residuals
 CHUNK = 32  # columns that are multiplied together
 MOST_POSES = 100  # poses that show an effect well enough, evenly chosen of more
+MOST_VALUES, FEWEST_POSES = 6000, 30  # values of these, and poses that they need at least
 
 
 @dataclass(frozen=True, eq=False)
