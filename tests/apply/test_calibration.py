@@ -8,17 +8,20 @@ import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 
 import loopcal as lc
+from loopcal.apply import calibration
 from loopcal.apply.calibration import calibrate
 from loopcal.apply.calibration_options import CalibrationOptions, split_data
 from loopcal.apply.conformity import STATED
 from loopcal.apply.verdict import Verdict, choose_next_step, decide_verdict
 from loopcal.cli.entry_point import main
 from loopcal.errors import DataError, EstimationError
+from loopcal.estimate import fit_linearization
 from loopcal.estimate.penalties import MAP
 from loopcal.estimate.pose_rows import BLOCK, EXACT_BLOCK
 from loopcal.findings import Quantity, Severity, report_finding
@@ -58,6 +61,21 @@ def unvalidated(robot, data):
         robot, data, progress=lambda done, total, what: steps.append((done, total, what))
     )
     return report, steps
+
+
+def test_budget_is_computed_when_it_is_asked_for_and_the_fit_is_linearized_once(
+    robot, data, monkeypatch
+):
+    budget = Mock(side_effect=calibration.compute_error_budget)
+    linearized = Mock(side_effect=fit_linearization.linearize_at_estimate)
+    monkeypatch.setattr(calibration, "compute_error_budget", budget)
+    monkeypatch.setattr(fit_linearization, "linearize_at_estimate", linearized)
+    found = calibrate(robot, data, CalibrationOptions(hold_out=0.25))
+    assert budget.call_count == 0
+    assert found.budget is found.budget
+    assert budget.call_count == 1
+    # with columns of errors, it is linearized again at the same solution
+    assert sum(len(call.args) == 2 for call in linearized.call_args_list) == 1
 
 
 def test_good_calibration_reaches_the_noise_floor_and_has_a_next_step(report):
