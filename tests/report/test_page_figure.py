@@ -101,6 +101,10 @@ def test_a_robot_has_the_words_of_matplotlib(name) -> None:
     assert words[0] == words[1]
 
 
+def write(figure: Any) -> str:
+    return figure.write_svg("f")
+
+
 def read_dots(svg: str, color: str) -> np.ndarray:
     """Return the places of round markers of a color [pt]."""
     (path,) = re.findall(rf'<path d="([^"]*)" stroke="{color}"[^>]*linecap="round"', svg)
@@ -117,7 +121,7 @@ def test_markers_are_at_their_values(is_logarithmic) -> None:
             scale_logarithmically(axes.yaxis)
         axes.set_xlim(-10.0, 10.0)
         axes.set_ylim(100.0, 1.0)  # upside down
-    dots = read_dots(figure.write_svg("f"), "#123456")
+    dots = read_dots(write(figure), "#123456")
     left, top, width, height = axes.box
     up = np.log10(y) / 2.0 if is_logarithmic else (y - 1.0) / 99.0
     np.testing.assert_allclose(dots[:, 0], left + width * (x + 10.0) / 20.0, atol=0.01)
@@ -129,7 +133,7 @@ def test_equal_scales_have_equal_lengths() -> None:
         figure, ((axes,),) = start_panels(6.0, 3.0, 1, 1)
         axes.plot([0.0, 1.0], [0.0, 1.0], "o", color="#123456")
         axes.set_aspect("equal", adjustable="datalim")
-    (a, b) = read_dots(figure.write_svg("f"), "#123456")
+    (a, b) = read_dots(write(figure), "#123456")
     assert b[0] - a[0] == pytest.approx(a[1] - b[1], abs=0.02)
 
 
@@ -189,7 +193,7 @@ def test_what_has_no_number_is_left_out() -> None:
         full.bar([0.0, 1.0], [np.nan, 2.0], color="#654321")
         full.errorbar(holes[:2], [0.0, 1.0], xerr=holes[:2], fmt="s", color="#123456")
         full.annotate("nowhere", (np.nan, 1.0))
-    svg = figure.write_svg("f")
+    svg = write(figure)
     ET.fromstring(svg)
     assert re.search("nan|inf|nowhere", svg) is None
     assert len(read_dots(svg, "#123456")) == 1
@@ -201,4 +205,4 @@ def test_many_markers_are_short() -> None:
     with drawing_for_page():
         figure, ((axes,),) = start_panels(6.0, 4.0, 1, 1)
         axes.plot(*x, "^", color="#123456")
-    assert len(figure.write_svg("f")) < 20 * x.shape[1]
+    assert len(write(figure)) < 20 * x.shape[1]
