@@ -19,7 +19,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
@@ -125,8 +125,8 @@ def _join_rows(data: Measurements, sigma: np.ndarray) -> np.ndarray:
 def ask_everything(robot: Mechanism, data: Measurements) -> Identification:
     """Fit by least squares, and ask for all that the result promises."""
     fit = identify(robot, data, LeastSquares())
-    fit.to_dict()
-    fit.arrays()
+    for field in fields(fit):
+        getattr(fit, field.name)
     return fit
 
 

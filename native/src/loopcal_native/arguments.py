@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 from loopcal.engine import ParameterMap, Program, State, Sums
 from loopcal.typing import FloatArray, IntArray
-from loopcal_native.library import Strided, as_reals, describe
+from loopcal_native.library import Strided, as_reals, describe, locate
 from loopcal_native.programs import flatten_pattern, require
 
 
@@ -119,4 +119,4 @@ def describe_all(arrays: Sequence[FloatArray | None]) -> ctypes.Array[Strided]:
 
 def list_addresses(arrays: Sequence[FloatArray]) -> ctypes.Array[ctypes.c_void_p]:
     """Return the addresses of arrays."""
-    return (ctypes.c_void_p * len(arrays))(*(a.ctypes.data for a in arrays))
+    return (ctypes.c_void_p * len(arrays))(*(locate(a) for a in arrays))

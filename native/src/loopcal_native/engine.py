@@ -50,6 +50,7 @@ from loopcal_native.library import (
     as_reals,
     list_instruction_sets,
     load_library,
+    locate,
     require_done,
 )
 from loopcal_native.library import ComparedPoses as ComparedPosesOfLibrary
@@ -124,8 +125,8 @@ class NativeFunctions:
             calls = TaskCalls(task) if task is not None else None
             outcome = load_library().loopcal_solve(
                 self.instruction_set,
-                flat.structure.ctypes.data,
-                flat.numbers.ctypes.data,
+                locate(flat.structure),
+                locate(flat.numbers),
                 describe_all([*arrays, goals, *(given or (None, None))]),
                 describe_all(joints),
                 t,
@@ -134,9 +135,9 @@ class NativeFunctions:
                 order,
                 calls.function if calls else NO_TASK,
                 None,
-                T.ctypes.data,
+                locate(T),
                 list_addresses(out),
-                *(a.ctypes.data for a in (residual, iterations, status, sign)),
+                *(locate(a) for a in (residual, iterations, status, sign)),
             )
             if calls is not None and outcome == TASK_FAILED:
                 raise calls.error
@@ -175,12 +176,12 @@ class NativeFunctions:
         require_start(program, arrays[0], arrays[1], t)
         outcome = load_library().loopcal_certify(
             self.instruction_set,
-            flat.structure.ctypes.data,
-            flat.numbers.ctypes.data,
+            locate(flat.structure),
+            locate(flat.numbers),
             describe_all(arrays),
             t,
             n,
-            sign.ctypes.data,
+            locate(sign),
         )
         require_done(outcome)
         return sign
@@ -213,17 +214,17 @@ class NativeFunctions:
         )
         iterations[:] = 0
         listed = list_addresses(out)
-        addresses = [a.ctypes.data for a in (residual, status, closure_sign, arrives)]
+        addresses = [locate(a) for a in (residual, status, closure_sign, arrives)]
         outcome = load_library().loopcal_reach(
             self.instruction_set,
-            flat.structure.ctypes.data,
-            flat.numbers.ctypes.data,
+            locate(flat.structure),
+            locate(flat.numbers),
             describe_all(arrays),
-            columns.ctypes.data,
-            base.ctypes.data,
+            locate(columns),
+            locate(base),
             t,
             n,
-            ReachOutput(T.ctypes.data, ctypes.addressof(listed), *addresses),
+            ReachOutput(locate(T), ctypes.addressof(listed), *addresses),
         )
         require_done(outcome)
         state = State(T, tuple(out), status, residual, iterations, closure_sign)
@@ -246,8 +247,8 @@ class NativeFunctions:
             require_done(
                 call(
                     self.instruction_set,
-                    flat.structure.ctypes.data,
-                    flat.numbers.ctypes.data,
+                    locate(flat.structure),
+                    locate(flat.numbers),
                     describe_all([arrays[0], None if free else arrays[1], arrays[2]]),
                     describe_all(joints),
                     list_addresses(out),
@@ -285,13 +286,13 @@ class NativeFunctions:
             require_done(
                 call(
                     self.instruction_set,
-                    flat.structure.ctypes.data,
-                    flat.numbers.ctypes.data,
-                    entries.ctypes.data,
+                    locate(flat.structure),
+                    locate(flat.numbers),
+                    locate(entries),
                     describe_all(arrays),
                     describe_all(joints),
-                    by_parameter.ctypes.data,
-                    by_reading.ctypes.data,
+                    locate(by_parameter),
+                    locate(by_reading),
                     t,
                     n,
                 )
@@ -310,7 +311,7 @@ class NativeFunctions:
         )
         (t, p), m, out = factor.shape[:2], rows.shape[1], np.empty_like(factor)
         stride = m * p if len(rows) == t else 0
-        addresses = (a.ctypes.data for a in (factor, rows, out))
+        addresses = (locate(a) for a in (factor, rows, out))
         call = load_library().loopcal_fold
         require_done(call(self.instruction_set, *addresses, t, m, p, stride))
         return out
@@ -338,15 +339,15 @@ class NativeFunctions:
             require_done(
                 call(
                     self.instruction_set,
-                    flat.structure.ctypes.data,
-                    flat.numbers.ctypes.data,
-                    entries.ctypes.data,
+                    locate(flat.structure),
+                    locate(flat.numbers),
+                    locate(entries),
                     describe_all(arrays),
                     describe_all(joints),
                     ctypes.byref(rows.describe()),
-                    factor.ctypes.data,
-                    out.ctypes.data,
-                    is_finite.ctypes.data,
+                    locate(factor),
+                    locate(out),
+                    locate(is_finite),
                     t,
                     n,
                 )
@@ -387,22 +388,22 @@ class NativeFunctions:
             *parts,
         )
         addresses, strided = list_addresses(joints), describe_all(joints)
-        outputs = [a.ctypes.data for a in (residual, iterations, status, sign)]
+        outputs = [locate(a) for a in (residual, iterations, status, sign)]
         lists = ctypes.addressof(addresses), ctypes.addressof(strided)
-        numbers = (a.ctypes.data for a in (pose, reference, whitener))
+        numbers = (locate(a) for a in (pose, reference, whitener))
         require_done(
             load_library().loopcal_fold_compared(
                 self.instruction_set,
-                flat.structure.ctypes.data,
-                flat.numbers.ctypes.data,
-                entries.ctypes.data,
+                locate(flat.structure),
+                locate(flat.numbers),
+                locate(entries),
                 describe_all(arrays),
                 describe_all(begin),
                 ComparedPosesOfLibrary(count, height, *numbers),
-                SolvedPoses(T.ctypes.data, lists[0], *outputs, lists[1]),
-                factor.ctypes.data,
-                out.ctypes.data,
-                is_finite.ctypes.data,
+                SolvedPoses(locate(T), lists[0], *outputs, lists[1]),
+                locate(factor),
+                locate(out),
+                locate(is_finite),
                 n,
                 MOST_STEPS,
             )
@@ -420,7 +421,7 @@ class NativeFunctions:
         t, p = right.shape
         require(triangle.shape == (t, p, p), f"triangles ({t}, {p}, {p}), not {triangle.shape}")
         x, growth = np.empty_like(right), np.zeros(t)
-        addresses = (a.ctypes.data for a in (triangle, right, x, growth))
+        addresses = (locate(a) for a in (triangle, right, x, growth))
         call = load_library().loopcal_solve_triangles
         require_done(call(self.instruction_set, *addresses, t, p))
         return x, growth
@@ -433,7 +434,7 @@ class NativeFunctions:
         require_rows("T", arrays[0], (4, 4), shape)
         require_rows("references", arrays[1], (12,), shape)
         residual, by_twist = np.empty((t, n, 6)), np.empty((t, n, 6, 6))
-        addresses = residual.ctypes.data, by_twist.ctypes.data
+        addresses = locate(residual), locate(by_twist)
         if t * n:
             call = load_library().loopcal_compare_poses
             require_done(call(self.instruction_set, describe_all(arrays), *addresses, t, n))

@@ -10,7 +10,7 @@ import numpy as np
 
 from loopcal.engine import TwistRows
 from loopcal.typing import FloatArray, IntArray
-from loopcal_native.library import Strided, as_reals
+from loopcal_native.library import Strided, as_reals, locate
 from loopcal_native.library import TwistRows as StridedRows
 from loopcal_native.programs import require
 
@@ -26,8 +26,8 @@ class FlatRows(NamedTuple):
         """Return the addresses and strides of these arrays, which must be kept."""
         count, strided = len(self.pose), []
         for array, size in ((self.by_twist, 6 * count), (self.residual, count)):
-            strided.append(Strided(array.ctypes.data, size if len(array) > 1 else 0, 0))
-        return StridedRows(count, self.pose.ctypes.data, *strided)
+            strided.append(Strided(locate(array), size if len(array) > 1 else 0, 0))
+        return StridedRows(count, locate(self.pose), *strided)
 
 
 def flatten_rows(observed: Sequence[TwistRows], t: int, n: int) -> FlatRows:

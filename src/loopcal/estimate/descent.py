@@ -460,6 +460,8 @@ class _Candidate(NamedTuple):
 
     def take(self, trials: np.ndarray) -> _Point:
         """Return the points of some trials."""
+        if len(trials) == len(self.arrival):
+            return self.run.locate(self.linearized, self.arrival)
         needed = replace(self.linearized, nuisance=None, poses=None)  # the rest is not copied
         return self.run.locate(needed.take(trials), self.arrival[trials])
 

@@ -167,7 +167,8 @@ class PoseRows:
         is_simple = is_square(robot) and not robot.is_serial
         if not (self.are_plain and self.is_kept and is_simple and len(self.rows) == 1):
             return None
-        rows, columns = self.rows[0], self.rows[0].take_trials(np.zeros(1, dtype=np.int64))[0]
+        (rows,) = self.blocks[0].rows
+        columns, _ = rows.take_trials(np.zeros(1, dtype=np.int64))
         is_one = len(rows.measured) == len(rows.whitener) == 1 and rows.offset is None
         pairs = rows.kind.compare_platform(columns) if is_one and columns.is_complete else None
         if pairs is None or (rows.poses[1:] < rows.poses[:-1]).any():
