@@ -35,7 +35,7 @@ def dataclass(
     """Return the decorator of a frozen dataclass; arguments as of `dataclasses.dataclass`."""
 
     def define(cls: Class) -> Class:
-        own = vars(cls).get("__annotations__", {})
+        own = cls.__annotations__  # of this class only
         stated = {name: getattr(cls, name) for name in own if hasattr(cls, name)}
         # what Python finds in the fields of a class that has nothing else
         names: Any = {"__module__": cls.__module__, "__doc__": "-", "__annotations__": own}
