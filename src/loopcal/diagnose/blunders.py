@@ -51,6 +51,7 @@ from loopcal.units import Dimension
 # the verdict.
 LEVEL = FALSE_ALARMS["held-out rows"]
 FOLDED = 10_000  # rows that are factorized at once
+TOGETHER = 16  # blocks whose rows are made at once
 # Standard deviation of an unknown nuisance parameter, in sizes of the robot or radians.
 ANYWHERE = 1e3
 
@@ -165,7 +166,11 @@ class Predictor(NamedTuple):
         groups = []
         for blocks, columns, r in iterate_blocks(problem.rows_at(z, values), member, total):
             present = np.any(columns != 0.0, axis=2) | (r != 0.0)
-            groups.append((blocks, columns @ by_y / noise, r / noise, present))
+            parts = []
+            for few in np.array_split(columns, -(-len(columns) // TOGETHER)):
+                used = few.any(axis=(0, 1))  # those of their sessions
+                parts.append(few[..., used] @ by_y[used] / noise)
+            groups.append((blocks, np.concatenate(parts), r / noise, present))
         return HeldOutBlocks(poses, member, tuple(groups))
 
     def _predict(self, names: tuple[str, ...], dimensions: tuple[Dimension, ...]) -> FloatArray:
