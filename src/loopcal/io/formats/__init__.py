@@ -27,6 +27,7 @@ FORMATS: Registry[Format] = Registry(
         "mjcf": "loopcal.io.formats.linkages.mjcf:FORMAT",
         "hangprinter": "loopcal.io.formats.hangprinter:FORMAT",
         "maslow": "loopcal.io.formats.maslow:FORMAT",
+        "linuxcnc-kinematics": "loopcal.io.formats.linuxcnc_kinematics:FORMAT",
         "c": "loopcal.io.formats.c_kinematics:FORMAT",
         "json": "loopcal.io.formats.import_export:JSON",
         "csv": "loopcal.io.formats.import_export:CSV",

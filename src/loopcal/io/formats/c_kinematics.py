@@ -9,7 +9,7 @@ Derivation: docs/theory/kinematics.md.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from importlib.resources import files
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from loopcal.engine.numpy_engine.closure import place_links
-from loopcal.engine.program import BASE
+from loopcal.engine.program import BASE, LENGTH, PITCH
 from loopcal.errors import DataError
 from loopcal.findings import report_finding
 from loopcal.io.formats.program_format import Exported, ExportSource, Format
@@ -49,6 +49,9 @@ COORDINATES = (*POSITION, *TILT, *EULER)
 """Platform coordinates in the order of the C file."""
 SHAPES = ("offset", "gain", "curve", *HARMONICS)
 """Terms of a transmission in the order of the C file."""
+LINK = "LINK"
+MOVABLE = ("double LINK", "struct limb", "double PITCH", "struct transmission")
+"""Tables that are not constant in a file with parameters."""
 TESTS, SEED = 50, 0
 """Poses of the test table, and the seed that draws them from the workspace."""
 AGREEMENT = 1e-12
@@ -98,7 +101,8 @@ class _Transmission(NamedTuple):
 
 class _Tables(NamedTuple):
     """Tables of all stages, one after the other. weights : of the drives of a stage, and the first
-    of these.
+    of these. slots : what each slot of the robot moves, by the number of the stage and the slot:
+    table, index and axis; None for what the C file cannot change.
     """
 
     links: list[list[float]]
@@ -110,6 +114,9 @@ class _Tables(NamedTuple):
     weights: list[tuple[int, FloatArray]]
     pieces: list[list[float]]
     stages: list[list[Any]]
+    nominal: list[list[float]]
+    displacements: list[FloatArray]
+    slots: list[list[tuple[str, int, int] | None]]
 
 
 def write(source: ExportSource, into: Path | None) -> Exported:
@@ -118,18 +125,84 @@ def write(source: ExportSource, into: Path | None) -> Exported:
     DataError : the robot has more drives than freedoms, in limbs with passive joints.
     """
     del into
-    robot = source.robot
+    return Exported(fill_template(source.robot, ()), ())
+
+
+def fill_template(robot: Mechanism, parameters: Sequence[int]) -> str:
+    """Return the C file of a robot, in which some parameters, by their places, can change."""
     commanded = np.array([a.reference is None for a in robot.actuators])
-    head, body = _write_tables(robot, commanded)
+    head, body = _write_tables(robot, commanded, parameters)
     text = files("loopcal.io.formats").joinpath("kinematics.c").read_text("utf-8")
     for mark, part in (("HEAD", head), ("TABLES", body), ("TESTS", _write_tests(robot, commanded))):
         text = text.replace(f"/* {mark} */", part)
-    return Exported(text, ())
+    return text
 
 
-def _write_tables(robot: Mechanism, commanded: BoolArray) -> tuple[str, str]:
-    """Return the public constants and the tables."""
-    tables, drives, carrying = _Tables([], [], [], [], [], [], [], [], []), 0, set[int]()
+def list_movable(robot: Mechanism) -> list[int]:
+    """Return the places of the parameters that a C file can change: they move links, lengths and
+    terms of transmissions, each by a fixed factor.
+    """
+    tables = _collect_tables(robot, np.ones(len(robot.actuators), bool))
+    return [p for p in range(len(robot.values)) if _list_effects(robot, tables, p)]
+
+
+def _list_effects(
+    robot: Mechanism, tables: _Tables, parameter: int
+) -> list[tuple[str, int, int, float]]:
+    """Return what a parameter moves, each with its factor; nothing where some of it cannot be
+    changed.
+    """
+    effects = []
+    for stage, moved in zip(robot.blocks, tables.slots, strict=True):
+        column = parameter - stage.parameters.start
+        slots = stage.robot.slots
+        if not 0 <= column < slots.matrix.shape[1]:
+            continue
+        if any(column in inputs for _, inputs, _ in slots.shared):
+            return []
+        for row in np.flatnonzero(slots.matrix[:, column]).tolist():
+            if (what := moved[row]) is None:
+                return []
+            effects.append((*what, float(slots.matrix[row, column])))
+    return effects
+
+
+def _write_parameters(robot: Mechanism, tables: _Tables, parameters: Sequence[int]) -> list[str]:
+    """Return the tables of the parameters that can change."""
+    effects = [
+        (i, *effect) for i, p in enumerate(parameters) for effect in _list_effects(robot, tables, p)
+    ]
+    links = sorted({index for _, what, index, *_ in effects if what == LINK})
+    numbers = sorted({effect[1:4] for effect in effects if effect[1] != LINK})
+    identified = {
+        "PITCH_OF_JOINT": lambda i, _: tables.joints[i].pitch,
+        "LENGTH_OF_LIMB": lambda i, _: tables.limbs[i].length,
+        "TERM_OF_SUM": lambda i, term: tables.sums[i].term[term],
+    }
+    rows = [
+        [i, links.index(index), axis, factor]
+        if what == LINK
+        else [i, numbers.index((what, index, axis)), -1, factor]
+        for i, what, index, axis, factor in effects
+    ]
+    moved = [[i, tables.nominal[i], tables.displacements[i].tolist()] for i in links]
+    own = [[*number, identified[number[0]](*number[1:])] for number in numbers]
+    none = [[0] * 4]  # C has no empty tables
+    return [
+        f"#define LINKS {len(tables.links)}",
+        f"#define MOVED_LINKS {len(links)}",
+        f"#define MOVED_NUMBERS {len(numbers)}",
+        f"#define EFFECTS {len(rows)}",
+        _table("double IDENTIFIED[KINEMATICS_PARAMETERS]", robot.values[list(parameters)].tolist()),
+        _table("struct moved_link MOVED_LINK[]", moved or [[0, [0.0] * 12, [0.0] * 6]]),
+        _table("struct moved_number MOVED_NUMBER[]", own or [["TERM_OF_SUM", 0, 0, 0.0]]),
+        _table("struct effect EFFECT[]", rows or none),
+    ]
+
+
+def _collect_tables(robot: Mechanism, commanded: BoolArray) -> _Tables:
+    """Return the tables of all stages."""
+    tables, drives, carrying = _Tables(*([] for _ in _Tables._fields)), 0, set[int]()
     carrying.update(list_carrying_stages(robot))
     reading = np.where(commanded, np.cumsum(commanded) - 1, -1)
     for i, stage in enumerate(robot.blocks):
@@ -139,6 +212,15 @@ def _write_tables(robot: Mechanism, commanded: BoolArray) -> tuple[str, str]:
         _add_limbs(tables, stage.robot, e, drives)
         _add_transmissions(tables, stage, tau, reading[stage.actuators].tolist(), drives)
         drives += stage.robot.program.n_joints
+    return tables
+
+
+def _write_tables(
+    robot: Mechanism, commanded: BoolArray, parameters: Sequence[int]
+) -> tuple[str, str]:
+    """Return the public constants and the tables."""
+    tables = _collect_tables(robot, commanded)
+    drives = sum(stage.robot.program.n_joints for stage in robot.blocks)
     weights = np.zeros((len(tables.sums), drives))
     for row, (first, own) in zip(weights, tables.weights, strict=True):
         row[first : first + len(own)] = own
@@ -161,6 +243,7 @@ def _write_tables(robot: Mechanism, commanded: BoolArray) -> tuple[str, str]:
         "COORDINATES": len(names),
         "BODIES": len(tables.bodies),
         "JOINTS": len(joints),
+        "PARAMETERS": len(parameters),
     }
     constants = {
         "STAGES": len(tables.stages),
@@ -197,6 +280,8 @@ def _write_tables(robot: Mechanism, commanded: BoolArray) -> tuple[str, str]:
         _table("struct stage STAGE[STAGES]", tables.stages),
         _table("kinematics_state HOME", home),
     ]
+    if parameters:
+        parts += _write_parameters(robot, tables, parameters)
     if tables.pieces:
         parts.append(_table("double PIECE[PIECES][6]", tables.pieces))
     lines = [*_describe(robot, commanded), ""]
@@ -239,10 +324,11 @@ def _write(value: Any) -> str:
 def _table(declaration: str, rows: Iterable[Any]) -> str:
     """Return a constant table, a line for each row of more than one number."""
     rows = list(rows)
+    storage = "TABLE" if declaration.startswith(MOVABLE) else "static const"
     if not rows or isinstance(rows[0], (bool, int, float, np.number, np.bool_)):
-        return f"static const {declaration} = {_write(rows)};"
+        return f"{storage} {declaration} = {_write(rows)};"
     lines = "".join(f"    {_write(row)},\n" for row in rows)
-    return f"static const {declaration} = {{\n{lines}}};"
+    return f"{storage} {declaration} = {{\n{lines}}};"
 
 
 def _flatten(T: FloatArray) -> list[float]:
@@ -253,6 +339,8 @@ def _flatten(T: FloatArray) -> list[float]:
 def _add_limbs(tables: _Tables, robot: Mechanism, e: FloatArray, drives: int) -> None:
     """Add bodies and limbs of a stage with displacements e (1, d); `drives` are those before."""
     program, home, first = robot.program, robot.home_state, len(tables.bodies)
+    moved: list[tuple[str, int, int] | None] = [None] * len(robot.slots.matrix)
+    tables.slots.append(moved)
     tables.bodies.extend(_flatten(T[0, 0]) for T in (home.T, *home.others))
     tables.moves.extend([f in freedoms for f in range(6)] for freedoms in program.nodes)
     for group, joints in zip(program.groups, home.joints, strict=True):
@@ -267,6 +355,17 @@ def _add_limbs(tables: _Tables, robot: Mechanism, e: FloatArray, drives: int) ->
             for j in range(count + 2):
                 rotation = placed.rotation[j][..., min(k, placed.rotation.shape[3] - 1), 0]
                 tables.links.append([*rotation.ravel().tolist(), *placed.origin[j, :, k, 0]])
+                tables.nominal.append(_flatten(group.links[k, j]))
+                tables.displacements.append(np.zeros(6))
+            for i, slot in enumerate(group.slots):
+                place = group.columns.start + k * len(group.slots) + i
+                if slot.axis == PITCH:
+                    moved[place] = ("PITCH_OF_JOINT", joint + slot.element, 0)
+                elif slot.axis == LENGTH:
+                    moved[place] = ("LENGTH_OF_LIMB", len(tables.limbs), 0)
+                else:
+                    moved[place] = (LINK, link + slot.element, slot.axis)
+                    tables.displacements[link + slot.element][slot.axis] += e[0, place]
             for j, letter in enumerate(f"{group.joints}P"):
                 actuator = int(group.actuator[j, k])
                 drive = -1 if actuator < 0 else drives + actuator
@@ -293,6 +392,9 @@ def _add_transmissions(
     for a, row in enumerate(constants):
         source, points = int(row[SOURCE]), row[FIXED:][np.isfinite(row[FIXED:])]
         is_fixed = source < 0 or bool(np.isfinite(row[REFERENCE]))
+        for i, name in enumerate(() if is_fixed else SHAPES):
+            place = stage.robot.slots.n_displacements + a * tau.shape[2] + TERMS.index(name)
+            tables.slots[-1][place] = ("TERM_OF_SUM", len(tables.sums), i)
         pieces: list[list[float]] = []
         if len(points):
             own = select_table(tau, constants)[0, a, : len(points)]

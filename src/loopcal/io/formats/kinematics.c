@@ -4,8 +4,8 @@
 /* Numbers are in m, rad; a pose is the rotation by rows, then the position of the platform in the
  * base. A state is where the machine is: begin with kinematics_home, and pass the last state on, from
  * which the next solution begins. A call that fails leaves state and output as they are. */
-#ifndef KINEMATICS_H
-#define KINEMATICS_H
+#ifndef LOOPCAL_KINEMATICS_H
+#define LOOPCAL_KINEMATICS_H
 
 enum {
     KINEMATICS_OK,
@@ -36,14 +36,31 @@ void kinematics_coordinates(const double pose[12], double coordinates[KINEMATICS
 /* Write the twist of the platform (rotation, velocity of its origin, in the base) by each reading. */
 int kinematics_jacobian(const kinematics_state *state, double by_reading[6][KINEMATICS_READINGS]);
 
+#if KINEMATICS_PARAMETERS > 0
+/* Set all parameters, in SI units. No other call may run at the same time. */
+void kinematics_set_parameters(const double values[KINEMATICS_PARAMETERS]);
+#endif
+
 #endif
 #ifndef KINEMATICS_DECLARATIONS
 
 #include <math.h>
 
+/* Storage of the equations: `static` where a thread has a small stack and no other one calls. */
+#ifndef KINEMATICS_WORK
+#define KINEMATICS_WORK
+#endif
+
 #define PI 3.14159265358979323846
 #define BODIES KINEMATICS_BODIES
 #define JOINTS KINEMATICS_JOINTS
+
+/* Tables that parameters move are constant, unless the file has parameters. */
+#if KINEMATICS_PARAMETERS > 0
+#define TABLE static
+#else
+#define TABLE static const
+#endif
 
 enum { DISTANCE, BALL, RIGID };
 enum { X, Y, Z, PHI, THETA, PSI, ROLL, PITCHING, YAW };
@@ -60,6 +77,22 @@ struct transmission {
     double term[7], frequency, fixed, begin;
     struct triangle { double level, reach, lead, side, middle; } triangle;
     int reading, piece, pieces;
+};
+
+/* What parameters move: a link along and about its axes, or a number of the tables. */
+enum { PITCH_OF_JOINT, LENGTH_OF_LIMB, TERM_OF_SUM };
+struct moved_link {
+    int link;
+    double nominal[12], displacement[6];
+};
+struct moved_number {
+    int what, index, term;
+    double identified;
+};
+/* A parameter's change of axis `axis` of a moved link, or of a moved number where axis is -1. */
+struct effect {
+    int parameter, index, axis;
+    double coefficient;
 };
 
 /* A mechanism on the platform of another one. */
@@ -165,6 +198,44 @@ static void move_body(double *pose, const double *twist)
         pose[9 + i] += twist[3 + i];
     }
 }
+
+#if KINEMATICS_PARAMETERS > 0
+static double *find_number(const struct moved_number *m)
+{
+    switch (m->what) {
+    case PITCH_OF_JOINT: return &PITCH[m->index];
+    case LENGTH_OF_LIMB: return &LIMB[m->index].length;
+    default: return &TRANSMISSION[m->index].term[m->term];
+    }
+}
+
+void kinematics_set_parameters(const double values[KINEMATICS_PARAMETERS])
+{
+    double move[MOVED_LINKS][6], twist[6], change;
+    int i, k;
+    for (i = 0; i < MOVED_LINKS; i++)
+        for (k = 0; k < 6; k++)
+            move[i][k] = MOVED_LINK[i].displacement[k];
+    for (i = 0; i < MOVED_NUMBERS; i++)
+        *find_number(&MOVED_NUMBER[i]) = MOVED_NUMBER[i].identified;
+    for (i = 0; i < EFFECTS; i++) {
+        const struct effect *e = &EFFECT[i];
+        change = e->coefficient * (values[e->parameter] - IDENTIFIED[e->parameter]);
+        if (e->axis < 0)
+            *find_number(&MOVED_NUMBER[e->index]) += change;
+        else
+            move[e->index][e->axis] += change;
+    }
+    for (i = 0; i < MOVED_LINKS; i++) {
+        double *link = LINK[MOVED_LINK[i].link];
+        for (k = 0; k < 12; k++)
+            link[k] = MOVED_LINK[i].nominal[k];
+        turn(MOVED_LINK[i].nominal, move[i], twist);
+        turn(MOVED_LINK[i].nominal, move[i] + 3, twist + 3);
+        move_body(link, twist);
+    }
+}
+#endif
 
 /* --- Readings of drives and the sums of driven joints that they give. */
 
@@ -680,7 +751,7 @@ static void place_serial_stages(kinematics_state *s)
 /* Newton's method with step control from a state, which is changed. */
 static int solve(struct goal goal, kinematics_state *s)
 {
-    struct equations now, next;
+    KINEMATICS_WORK struct equations now, next;
     kinematics_state trial;
     double step[COLUMNS + 1], ignored[COLUMNS + 1], share = 1.0, length, fraction, removed, left;
     int k;
@@ -735,7 +806,7 @@ static int solve(struct goal goal, kinematics_state *s)
 static int find_sign(enum task task, const kinematics_state *s)
 {
     static const double any[SUMS + KINEMATICS_COORDINATES + KINEMATICS_READINGS];
-    struct equations e;
+    KINEMATICS_WORK struct equations e;
     struct goal goal;
     goal.task = task;
     goal.value = any;
@@ -810,7 +881,7 @@ int kinematics_jacobian(const kinematics_state *s, double by_reading[6][KINEMATI
 {
     double sums[SUMS], coordinates[KINEMATICS_COORDINATES], twist[6], part[3];
     double base[STAGES][12], platform[STAGES][12];
-    struct equations e;
+    KINEMATICS_WORK struct equations e;
     struct goal goal;
     int i, j, k, r, b, f, n, first;
     read_state(s, sums, coordinates);

@@ -1,0 +1,228 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The real LinuxCNC with simulated axes runs the exported kinematics."""
+
+import json
+import os
+import shutil
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+import loopcal as lc
+from loopcal.io.formats import linuxcnc as genhexkins
+from loopcal.io.formats.linuxcnc_kinematics import NAME, write
+from loopcal.io.formats.program_format import ExportSource
+from tests.robot_texts import load_text
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(
+        shutil.which("halcompile") is None or os.geteuid() != 0,
+        reason="needs linuxcnc-uspace-dev, and root to install a component",
+    ),
+]
+
+MM, POSES = 1e-3, 20
+UNITS = np.repeat([MM, np.pi / 180], 3)
+"""Of x, y, z, a, b, c in LinuxCNC."""
+MODULES = Path("/usr/lib/linuxcnc/modules")
+GAINS = """
+drives:
+  q: {reads: length, stroke: [-75, 75], unknown: [gain], ratio: {sd: 0.002}}
+"""
+"""Scale errors of screws, which genhexkins cannot store."""
+
+DRIVER = """#!/usr/bin/python3
+import json, time, linuxcnc
+moves, joints = json.load(open("moves.json"))
+command, state, reached = linuxcnc.command(), linuxcnc.stat(), []
+def wait(condition):
+    end = time.time() + 20
+    while time.time() < end:
+        state.poll()
+        if condition():
+            return
+        time.sleep(0.005)
+    raise SystemExit("LinuxCNC does not answer")
+command.state(linuxcnc.STATE_ESTOP_RESET); command.wait_complete()
+command.state(linuxcnc.STATE_ON); command.wait_complete()
+command.mode(linuxcnc.MODE_MANUAL); command.wait_complete()
+command.home(-1)
+wait(lambda: all(state.homed[:joints]))
+command.teleop_enable(1); command.wait_complete()
+command.mode(linuxcnc.MODE_MDI); command.wait_complete()
+for move in moves:
+    command.mdi("G0 " + " ".join("%s%.9f" % pair for pair in zip("XYZABC", move)))
+    command.wait_complete(20)
+    seen = []
+    def rests():
+        seen.append(state.joint_position[:joints])
+        return state.inpos and len(seen) > 9 and seen[-1] == seen[-2] == seen[-10]
+    wait(rests)
+    reached.append(state.joint_position[:joints])
+json.dump(reached, open("reached.json", "w"))
+"""
+
+SETTINGS = """[EMC]
+VERSION = 1.1
+MACHINE = simulated
+[DISPLAY]
+DISPLAY = ./driver.py
+[TASK]
+TASK = milltask
+CYCLE_TIME = 0.001
+[RS274NGC]
+PARAMETER_FILE = machine.var
+[EMCMOT]
+EMCMOT = motmod
+COMM_TIMEOUT = 4.0
+SERVO_PERIOD = 1000000
+[EMCIO]
+EMCIO = io
+CYCLE_TIME = 0.1
+[HAL]
+HALFILE = machine.hal
+[TRAJ]
+COORDINATES = XYZABC
+LINEAR_UNITS = mm
+ANGULAR_UNITS = degree
+MAX_LINEAR_VELOCITY = 2000
+DEFAULT_LINEAR_VELOCITY = 2000
+[KINS]
+"""
+AXIS = "[AXIS_{}]\nMIN_LIMIT = -900\nMAX_LIMIT = 900\nMAX_VELOCITY = 900\nMAX_ACCELERATION = 9000\n"
+JOINT = """[JOINT_{}]
+TYPE = LINEAR
+MIN_LIMIT = -900
+MAX_LIMIT = 900
+MAX_VELOCITY = 900
+MAX_ACCELERATION = 9000
+HOME_SEQUENCE = 0
+HOME = {}
+HOME_OFFSET = {}
+"""
+
+
+class Calibrated(NamedTuple):
+    """A true machine, what was identified of it, poses to go to (n, 6) [mm, deg], and the
+    covariance (n, 3, 3) [m^2] of the position there.
+    """
+
+    truth: lc.Mechanism
+    identified: lc.Mechanism
+    poses: np.ndarray
+    covariance: np.ndarray
+
+
+@pytest.fixture(scope="module")
+def calibrated(tmp_path_factory: pytest.TempPathFactory) -> Calibrated:
+    """A hexapod with scale errors of its screws, calibrated by 60 measured poses."""
+    shipped = (Path(lc.__file__).parent / "robots" / "hexapod-42.yaml").read_text("utf-8")
+    robot = load_text(tmp_path_factory.mktemp("robot"), shipped + GAINS)
+    spread = np.nan_to_num(robot.parameters.tolerance) * robot.parameters.free
+    errors = spread * np.random.default_rng(3).standard_normal(len(spread))
+    truth = robot.with_values(robot.values + errors)
+    sample = lc.sample_workspace(robot, 60 + POSES, 1)
+    target = sample.coordinates.copy()
+    noise = lc.Gaussian(np.repeat([5e-6, 2e-5], 3))
+    tracker = lc.Instrument((lc.Sensor(lc.Pose(), noise),))
+    report = lc.calibrate(robot, lc.simulate(truth, target[:60], tracker, seed=2))
+    fit = report.identification
+    covariance = lc.pose_uncertainty(fit, target[60:], frame="base").covariance[:, 3:, 3:]
+    return Calibrated(truth, fit.robot, target[60:] / UNITS, covariance)
+
+
+@pytest.fixture
+def component(tmp_path: Path) -> Iterator[Path]:
+    """Where the component of a test stands; it is removed from LinuxCNC afterwards."""
+    yield tmp_path / f"{NAME}.comp"
+    (MODULES / f"{NAME}.so").unlink(missing_ok=True)
+
+
+def run_linuxcnc(kinematics: str, hal: str, homes: np.ndarray, poses: np.ndarray) -> np.ndarray:
+    """Return joint positions (n, 6) [mm] after moves to poses, from a home."""
+    joints = [f"net J{j} joint.{j}.motor-pos-cmd => joint.{j}.motor-pos-fb" for j in range(6)]
+    lines = [
+        f"loadrt {kinematics}",
+        "loadrt [EMCMOT]EMCMOT servo_period_nsec=[EMCMOT]SERVO_PERIOD num_joints=[KINS]JOINTS",
+        "addf motion-command-handler servo-thread",
+        "addf motion-controller servo-thread",
+        *joints,
+        "net estop iocontrol.0.user-enable-out iocontrol.0.emc-enable-in",
+    ]
+    text = SETTINGS + f"KINEMATICS = {kinematics}\nJOINTS = 6\n"
+    text += "".join(map(AXIS.format, "XYZABC"))
+    text += "".join(JOINT.format(j, home, home) for j, home in enumerate(homes.tolist()))
+    with TemporaryDirectory() as name:  # LinuxCNC refuses to run as root
+        place = Path(name)
+        (place / "machine.ini").write_text(text)
+        (place / "machine.hal").write_text("\n".join(lines) + "\n" + hal + "\n")
+        (place / "moves.json").write_text(json.dumps([poses.tolist(), 6]))
+        (place / "driver.py").write_text(DRIVER)
+        (place / "driver.py").chmod(0o755)
+        for path in (place, *place.iterdir()):
+            shutil.chown(path, "nobody")
+        command = ["runuser", "-u", "nobody", "--", "env", "-i", f"HOME={place}"]
+        command += ["PATH=/usr/bin:/bin", "linuxcnc", "machine.ini"]
+        subprocess.run(command, cwd=place, timeout=120, check=False)
+        return np.array(json.loads((place / "reached.json").read_text()))
+
+
+def measure_errors(calibrated: Calibrated, readings: np.ndarray) -> np.ndarray:
+    """Return how far (n, 3) [m] the true machine stands from the poses at readings (n, 6) [m]."""
+    reached = lc.forward(calibrated.truth, readings).T
+    return reached[:, :3, 3] - calibrated.poses[:, :3] * MM
+
+
+def test_the_component_moves_the_true_machine_to_the_commanded_poses(
+    calibrated: Calibrated, component: Path
+) -> None:
+    source = ExportSource(calibrated.identified, {}, {})
+    component.write_text(write(source, None).text, "utf-8")
+    subprocess.run(["halcompile", "--install", component], check=True, capture_output=True)
+    wanted = lc.inverse(calibrated.identified, calibrated.poses * UNITS).q
+    homes = lc.inverse(calibrated.identified, calibrated.identified.home[None]).q[0] / MM
+    joints = run_linuxcnc(NAME, "", homes, calibrated.poses) * MM
+    assert np.abs(joints - wanted).max() < 1e-6 * MM
+    errors = measure_errors(calibrated, joints)
+    square = np.einsum("ni,nij,nj->n", errors, np.linalg.inv(calibrated.covariance), errors)
+    assert square.max() < 21.1  # chi-square of three, exceeded with 1e-4
+
+    # genhexkins has the corrected joint centers, but no scale of a screw
+    pins = genhexkins.write(source, None).text
+    lengths = calibrated.identified
+    starts = (
+        np.array(
+            [lengths.values[lengths.parameters.names.index(f"leg{n}.length")] for n in range(1, 7)]
+        )
+        / MM
+    )
+    struts = run_linuxcnc("genhexkins", pins, homes + starts, calibrated.poses)
+    left = measure_errors(calibrated, (struts - starts) * MM)
+    rms, of_old = (float(np.sqrt((e**2).sum(axis=1).mean())) for e in (errors, left))
+    assert rms < 10e-6
+    assert of_old > 5 * rms
+
+
+def test_a_pin_changes_a_parameter_without_compiling(
+    calibrated: Calibrated, component: Path
+) -> None:
+    nominal = calibrated.truth.nominal
+    source = ExportSource(nominal, {}, {})
+    component.write_text(write(source, None).text, "utf-8")
+    subprocess.run(["halcompile", "--install", component], check=True, capture_output=True)
+    table, own = nominal.parameters, calibrated.identified
+    units = [own.get_unit(d).factor_to_si for d in table.dimensions]
+    pins = [
+        f"setp {NAME}.{name} {value / unit!r}"
+        for name, value, unit in zip(table.names, own.values.tolist(), units, strict=True)
+    ]
+    homes = lc.inverse(own, own.home[None]).q[0] / MM
+    joints = run_linuxcnc(NAME, "\n".join(pins), homes, calibrated.poses[:5]) * MM
+    wanted = lc.inverse(own, calibrated.poses[:5] * UNITS).q
+    assert np.abs(joints - wanted).max() < 1e-6 * MM
