@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from loopcal import geometry, identify, load_robot
+from loopcal import geometry, identifiability, identify, load_robot
 from loopcal.diagnose.error_causes import explain_residuals
 from loopcal.diagnose.picture_errors import (
     find_print_scale,
@@ -127,3 +127,31 @@ def test_good_pictures_have_no_cause() -> None:
     fit = identify(robot, data)
     explained = explain_residuals(linearize_fit(fit, data, None))
     assert not explained.causes
+
+
+def make_delta(**settings):
+    """Return a rotary delta with an instrument that takes pictures of a board."""
+    ahead = geometry.make_pose(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.3]))
+    board = geometry.make_pose(np.diag([1.0, -1.0, -1.0]), np.array([-0.04, 0.03, 0.01]))
+    kind = Image(T_camera=ahead, T_board=board, corners=(3, 3), **settings)
+    return load_robot("rotary-delta"), Instrument((Sensor(kind, Gaussian(np.full(2, SIGMA))),))
+
+
+def test_size_of_a_machine_that_only_pictures_measure_follows_from_the_board() -> None:
+    found = {}
+    for name, unknown in (("stated", ("camera",)), ("unknown", ("camera", "print"))):
+        checked = identifiability(*make_delta(unknown=unknown), poses=12)
+        (found[name],) = [f for f in checked.findings if f.code == "identifiability.board-scale"]
+        found[name, "rank"] = checked.rank
+    assert found["stated"].data["is_known"]
+    assert found["unknown"].severity.value == "warning"
+    assert found["unknown", "rank"] == found["stated", "rank"] - 1  # the scale of all lengths
+    robot, instrument = load_robot("hexapod-42"), make_delta(unknown=("camera",))[1]
+    kind = replace(
+        instrument.sensors[0].kind,
+        T_camera=geometry.make_pose(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.7])),
+    )
+    of_rods = identifiability(
+        robot, Instrument((Sensor(kind, Gaussian(np.full(2, SIGMA))),)), poses=12
+    )
+    assert "identifiability.board-scale" not in [f.code for f in of_rods.findings]

@@ -44,7 +44,11 @@ from loopcal.diagnose.frame_drift import compare_shapes, report_base_targets
 from loopcal.diagnose.gauge_freedoms import interpret_fit
 from loopcal.diagnose.model_discrepancy import find_dense_regions
 from loopcal.diagnose.outliers import find_outliers
-from loopcal.diagnose.picture_errors import find_print_scale, measure_picture_errors
+from loopcal.diagnose.picture_errors import (
+    find_print_scale,
+    measure_picture_errors,
+    report_picture_scale,
+)
 from loopcal.diagnose.residual_patterns import CAUSE, POSE
 from loopcal.engine import collect_versions
 from loopcal.errors import DataError, EstimationError
@@ -335,6 +339,7 @@ def _report(
         *check_instruments(split.list_observations()),
         *report_freedoms(fit, fitted),
         *report_fixed_setup(fitted),
+        *report_picture_scale(fit.robot, fitted),
         *(report_equal_setup(fit, fitted) if fit.converged else ()),
         *report_heights(fit, fitted, heights),
         *report_base_targets(fitted),

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from loopcal.diagnose.gauge_freedoms import interpret_combinations, probe_readings
+from loopcal.diagnose.picture_errors import report_picture_scale
 from loopcal.errors import DataError, EstimationError, MechanismError
 from loopcal.estimate.determinable_setup import fix_undetermined_setup
 from loopcal.estimate.free_parameters import FreeParameters, free_only, select_free_parameters
@@ -176,6 +177,7 @@ class Identifiability(DrawnResult):
     unidentifiable : combinations of parameters that change no measured value.
     weak : the weakest directions known no better than the tolerances, weakest first.
     indices : observability O1 to O5. parameters : the result for each parameter.
+    scale : what the lengths follow from, where only pictures of a board show any.
     """
 
     free_parameters: FreeParameters
@@ -185,6 +187,7 @@ class Identifiability(DrawnResult):
     weak: tuple[Combination, ...]
     indices: Observability
     parameters: tuple[ParameterIdentifiability, ...]
+    scale: tuple[Finding, ...] = ()
 
     FIELDS: ClassVar[tuple[Field, ...]] = (
         *fields("n_parameters", "n_equations", "rank", "condition", "gap", "singular_values"),
@@ -296,7 +299,7 @@ class Identifiability(DrawnResult):
         findings += [combination.finding for combination in (*self.unidentifiable, *self.weak)]
         if (more := rank - self.improved - len(self.weak)) > 0:
             findings.append(report_finding("identifiability.more-weak-directions", count=more))
-        return (*findings, *self.free_parameters.findings())
+        return (*self.scale, *findings, *self.free_parameters.findings())
 
     @property
     def posterior(self) -> Posterior:
@@ -392,6 +395,7 @@ def identifiability(
         weak=tuple(describe_direction(free, V[:, i], float(s[i])) for i in weakest),
         indices=compute_observability(s, rank, equations),
         parameters=tuple(parameters),
+        scale=tuple(report_picture_scale(robot, data)),
     )
 
 

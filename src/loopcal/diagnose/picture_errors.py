@@ -19,11 +19,12 @@ from loopcal.errors import LoopcalError
 from loopcal.estimate.fit_linearization import FitLinearization
 from loopcal.estimate.identification import identify
 from loopcal.estimate.result import Identification
-from loopcal.findings import Finding, report_finding
+from loopcal.findings import Finding, Severity, report_finding
 from loopcal.frozen_dataclass import replace
 from loopcal.measure.kinds.image import Image
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations
+from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.solutions import forward
 from loopcal.numerics.statistics import choose_evenly
 from loopcal.typing import FloatArray
@@ -158,6 +159,28 @@ def find_print_scale(fit: Identification, data: Measurements) -> list[Finding]:
                 named: dict[str, Any] = {"board": board, "scale_x": x, "scale_y": y}
                 findings.append(report_finding("residuals.print-scale", **named))
     return findings
+
+
+def report_picture_scale(robot: Mechanism, data: Measurements) -> list[Finding]:
+    """Return what the lengths of a machine follow from where no reading, and no other instrument,
+    measures a length: from the square of the board, or from nothing where its print is unknown.
+    """
+    kinds = [rows.kind for rows in data.all_observations if len(rows)]
+    boards = [kind for kind in kinds if isinstance(kind, Image)]
+    lengths = [actuator.dimension for actuator in robot.actuators]
+    lengths += [column.dimension for kind in kinds for column in kind.columns]
+    if not boards or Dimension.LENGTH in lengths:
+        return []
+    setup = data.nuisance_parameters.table
+    free = {e.name for e in setup.entries if e.free and e.tolerance is None}
+    names = tuple(dict.fromkeys(kind.board for kind in boards))
+    is_known = not all(any(f".{n}".endswith(f".{b}.scale_x") for n in free) for b in names)
+    severity = Severity.INFO if is_known else Severity.WARNING
+    return [
+        report_finding(
+            "identifiability.board-scale", severity=severity, boards=names, is_known=is_known
+        )
+    ]
 
 
 def find_swapped_pictures(

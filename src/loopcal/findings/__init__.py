@@ -118,7 +118,7 @@ residuals.lack-of-fit residuals.repeatability-larger
 residuals.heavy-tailed
 noise.doubtful noise.no-degrees-of-freedom
 workflow.height-shift workflow.undetermined-scale
-setup.two-solutions setup.fixed
+setup.two-solutions setup.fixed identifiability.board-scale
 noise.consistent noise.estimated outliers.none outliers.one-degree workflow.height-tilt
 workflow.frame-freedoms
 prior.machine-unchanged model.simpler-suffices model.all-needed model.expected-gain
