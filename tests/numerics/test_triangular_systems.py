@@ -119,3 +119,19 @@ def test_a_zero_on_the_diagonal_is_refused(substitute) -> None:
     R[1, 1] = 0.0
     with pytest.raises(np.linalg.LinAlgError):
         substitute(R, np.ones((3, 1)))
+
+
+def test_a_large_triangle_is_solved_by_parts(monkeypatch):
+    """No part that is factorized has more unknowns than a leaf, and a zero is refused."""
+    rng = np.random.default_rng(0)
+    R = np.triu(rng.standard_normal((300, 300))) + 20.0 * np.eye(300)
+    b = rng.standard_normal((300, 4))
+    sizes, solve = [], np.linalg.solve
+    monkeypatch.setattr(np.linalg, "solve", lambda a, c: (sizes.append(len(a)), solve(a, c))[1])
+    for right in (b, b[:, 0]):
+        np.testing.assert_allclose(R @ substitute_backward(R, right), right, atol=1e-12)
+        np.testing.assert_allclose(R.T @ substitute_transposed(R, right), right, atol=1e-12)
+    assert max(sizes) <= 64
+    R[280, 280] = 0.0
+    with pytest.raises(np.linalg.LinAlgError):
+        substitute_backward(R, b)

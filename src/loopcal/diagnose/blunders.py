@@ -42,7 +42,7 @@ from loopcal.frozen_dataclass import dataclass, field, replace
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.readings import fill_in_reading_sigma
 from loopcal.mechanism.model import Mechanism
-from loopcal.numerics.decomposition import substitute_transposed
+from loopcal.numerics.decomposition import substitute_backward, substitute_transposed
 from loopcal.numerics.statistics import compute_chi_square_tail
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension
@@ -105,7 +105,7 @@ class HeldOutBlocks(NamedTuple):
                 stacked, count = [np.asarray(np.linalg.qr(np.concatenate(stacked), mode="r"))], 0
         triangle = np.asarray(np.linalg.qr(np.concatenate(stacked), mode="r"))
         R = triangle[:k, :k]
-        return R, -np.linalg.solve(R, triangle[:k, k])
+        return R, -substitute_backward(R, triangle[:k, k])
 
 
 @dataclass(frozen=True, eq=False)

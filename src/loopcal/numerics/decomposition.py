@@ -427,6 +427,10 @@ def _split(
 # Systems with one triangular matrix and many right sides, by numpy.
 
 
+LEAF = 64
+"""Unknowns of a triangle that is solved at once, by LU: the time of more grows with their cube."""
+
+
 def substitute_backward(R: FloatArray, b: FloatArray) -> FloatArray:
     """Return x with R x = b, for upper triangular R (n, n) and b (n, k).
 
@@ -434,7 +438,12 @@ def substitute_backward(R: FloatArray, b: FloatArray) -> FloatArray:
     ------
     numpy.linalg.LinAlgError : a zero on the diagonal.
     """
-    return np.asarray(np.linalg.solve(R, b), dtype=np.float64)
+    n = len(R)
+    if n <= LEAF:
+        return np.asarray(np.linalg.solve(R, b), dtype=np.float64)
+    low = substitute_backward(R[n // 2 :, n // 2 :], b[n // 2 :])
+    rest = b[: n // 2] - R[: n // 2, n // 2 :] @ low
+    return np.concatenate([substitute_backward(R[: n // 2, : n // 2], rest), low])
 
 
 def substitute_transposed(R: FloatArray, b: FloatArray) -> FloatArray:
@@ -442,7 +451,7 @@ def substitute_transposed(R: FloatArray, b: FloatArray) -> FloatArray:
 
     R' in reverse order of rows and columns is an upper triangle again.
     """
-    return np.asarray(np.linalg.solve(R.T[::-1, ::-1], b[::-1])[::-1], dtype=np.float64)
+    return substitute_backward(R.T[::-1, ::-1], b[::-1])[::-1]
 
 
 # Upper triangular systems R x = b of many trials, and how far each R is from a singular
