@@ -387,6 +387,19 @@ def test_bound_holds_for_every_subset_and_is_tighter_without_repeats(criterion, 
     assert free.efficiency(best) < capped.efficiency(best)
 
 
+def test_no_single_swap_improves_an_exchanged_design():
+    candidates = make_problem(np.random.default_rng(1).normal(size=(60, 3, 8))).scale_candidates(9)
+    for seed in range(20):
+        stream = np.random.default_rng(seed)
+        begin = exchange.draw_groups(candidates, stream, 9, None)
+        chosen, _ = exchange.exchange_from_start(candidates, begin, stream)
+        R = candidates.factor(chosen)
+        terms = exchange.compute_swap_terms(candidates.scoring, R, candidates.rows)
+        gains = np.array([exchange.score_swaps(terms, j) for j in chosen])
+        gains[:, chosen] = -np.inf
+        assert gains.max() <= exchange.GAIN * candidates.scoring.height
+
+
 def test_weights_of_120_poses_need_at_most_20_second_derivatives(monkeypatch):
     made = Mock(side_effect=exchange.differentiate_score)
     monkeypatch.setattr(exchange, "differentiate_score", made)

@@ -375,23 +375,24 @@ def _exchange_groups(
         return slopes, listed, compute_swap_terms(scoring, R, rows[np.append(chosen, listed)])
 
     R = candidates.factor(chosen)
-    history, idle, (slopes, listed, terms) = [scoring.score(R)], 0, prepare(R)
-    while idle < n and not _is_exhausted(history, n):
+    history, (slopes, listed, terms) = [scoring.score(R)], prepare(R)
+    idle = np.zeros(n, dtype=bool)  # groups that no swap has improved since the last exchange
+    while not (idle.all() or _is_exhausted(history, n)):
         for j in stream.permutation(n).tolist():
             # The score is concave: a swap gains at most the difference of the slopes.
             useful = np.flatnonzero(slopes[listed] > slopes[chosen[j]] + 0.5 * least)
             gain = score_swaps(terms, j, n + useful) if len(useful) else np.zeros(0)
-            idle += 1
+            idle[j] = True
             if gain.max(initial=-np.inf) > least:
                 trial = chosen.copy()
                 trial[j] = listed[useful[np.argmax(gain)]]
                 R = candidates.factor(trial)
                 score = scoring.score(R)
                 if score > history[-1]:
-                    chosen, idle = trial, 0
+                    chosen, idle = trial, np.zeros(n, dtype=bool)
                     slopes, listed, terms = prepare(R)
                     history.append(score)
-            if idle >= n or _is_exhausted(history, n):
+            if idle.all() or _is_exhausted(history, n):
                 break
     return chosen, history
 
