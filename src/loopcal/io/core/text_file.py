@@ -13,7 +13,7 @@ import math
 import os
 import stat
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from io import BufferedReader
 from pathlib import Path
 from typing import Any
@@ -148,10 +148,11 @@ def resolve_target(path: str | Path) -> Path:
 
 def resolve_links(path: Path) -> Path:
     """Return a path without links and dots; FileError for a circular link."""
-    try:
-        return path.resolve()
-    except (OSError, RuntimeError):
-        raise FileError("this symbolic link has no target. Choose another name", path) from None
+    with suppress(OSError, RuntimeError):
+        found = path.resolve()
+        if not found.is_symlink():  # Python 3.13 returns a circular link
+            return found
+    raise FileError("this symbolic link has no target. Choose another name", path)
 
 
 def write_text(path: str | Path, text: str) -> None:

@@ -343,7 +343,7 @@ def make_store(folder: Path, header: StoreHeader) -> None:
     path = folder / NAME
     refuse_network(folder)
     full = "store.not-made"
-    with _report_errors(path, full), closing(sqlite3.connect(path, PATIENCE)) as connection:
+    with _report_errors(path, full), closing(sqlite3.connect(path, timeout=PATIENCE)) as connection:
         connection.executescript(TABLES)
         StudyStore(path, connection).set_header(header)
 
@@ -361,7 +361,7 @@ def open_store(folder: Path) -> Iterator[StudyStore]:
     try:
         if descriptor is not None and lock(descriptor) is False:
             raise FileError(report_finding("store.other-driver"), folder)
-        with _report_errors(path), closing(sqlite3.connect(path, PATIENCE)) as connection:
+        with _report_errors(path), closing(sqlite3.connect(path, timeout=PATIENCE)) as connection:
             _refuse_others(path, connection)
             connection.execute("PRAGMA journal_mode = WAL")
             connection.execute("PRAGMA synchronous = NORMAL")
@@ -402,7 +402,7 @@ STILL = "immutable=1"
 
 def _connect(path: Path, mode: str) -> sqlite3.Connection:
     """Return a connection in a mode of SQLite's addresses."""
-    return sqlite3.connect(f"{path.resolve().as_uri()}?{mode}", PATIENCE, uri=True)
+    return sqlite3.connect(f"{path.resolve().as_uri()}?{mode}", timeout=PATIENCE, uri=True)
 
 
 def _is_disk_full(path: Path, mode: str) -> bool:
