@@ -453,8 +453,8 @@ def calibrate_trial(
         limit_position=limits.limit_position,
         limit_angle=limits.limit_angle,
     )
-    place = output.with_name(f"{output.name}-input")
     refuse_run_folder(output, force)
+    place = output.with_name(f"{output.name}-input")
     refuse_folder(place, INPUTS, force)
     contents = {
         ROBOT: format_robot(robot),
