@@ -78,3 +78,11 @@ def test_quantile_of_any_degrees_of_freedom_takes_few_steps(monkeypatch, degrees
         found = ours._find_student_quantile(degrees, probability)
         assert found == pytest.approx(scipy.special.stdtrit(degrees, probability), rel=1e-10)
         assert len(calls) < 80
+
+
+@pytest.mark.parametrize("degrees", [1e9, 1e13, 1e17, 1e30])
+def test_so_many_degrees_of_freedom_that_rounding_decides_give_limits(degrees) -> None:
+    """The series would need a share of the root of the degrees; its two halves are equal."""
+    assert ours.student_quantile(degrees, 0.975) == pytest.approx(1.959963984540054)
+    assert ours.beta_probability(degrees, degrees, 0.5) == pytest.approx(0.5)
+    assert ours.chi_square_quantile(degrees, 0.05) == pytest.approx(degrees, rel=1e-4)

@@ -24,6 +24,9 @@ from loopcal.typing import FloatArray
 FEW = 2000
 """Values up to which they are computed here."""
 
+MANY = 1e8
+"""Degrees of freedom up to which sums are short and rounding decides nothing."""
+
 STEPS, TINY = 100_000, 1e-300
 """Most terms of a continued fraction, which need a few times the root of the degrees of freedom;
 and the number that stands for zero in it."""
@@ -211,7 +214,8 @@ def _distribution(name: str, compute: Callable[..., float]) -> Callable[..., Flo
 
     def evaluate(*arguments: ArrayLike) -> FloatArray:
         arrays = np.broadcast_arrays(*arguments)
-        if arrays[0].size > FEW:
+        is_long = any(((array > MANY) & (array < np.inf)).any() for array in arrays[:-1])
+        if arrays[0].size > FEW or is_long:
             return np.asarray(getattr(import_module("scipy.special"), name)(*arrays))
         rows = list(zip(*(array.ravel().tolist() for array in arrays), strict=True))
         known = {row: compute(*map(float, row)) for row in dict.fromkeys(rows)}
