@@ -27,6 +27,7 @@ _NOT_PLAIN = re.compile(
     "\ufdd0-\ufdef\ufff9-\ufffb\ufffe\uffff"  # no characters of any text
     "]"
 )
+_NOT_PLAIN_JSON = re.compile(f"(?!\n){_NOT_PLAIN.pattern}")
 
 
 def find_not_plain(text: str, allowed: str = "") -> str | None:
@@ -69,7 +70,7 @@ def escape_json(text: str) -> str:
 
     Between the strings of JSON, line breaks are the only characters that are not plain.
     """
-    return _NOT_PLAIN.sub(lambda m: m[0] if m[0] == "\n" else json.dumps(m[0])[1:-1], text)
+    return _NOT_PLAIN_JSON.sub(lambda m: json.dumps(m[0])[1:-1], text)
 
 
 def quote(value: Any) -> str:

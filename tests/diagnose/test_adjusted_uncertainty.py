@@ -268,3 +268,25 @@ def test_a_fit_with_a_loss_says_which_tests_are_not_made():
     assert not PATTERNS & set(texts)
     assert "omits the chi-square test" in texts["noise.weighted"]
     assert "noise is not tested" not in texts["noise.weighted"]
+
+
+@pytest.mark.parametrize("kind", ["component", "tracker"])
+def test_runs_of_many_poses_stand_for_all_where_causes_are_sought(monkeypatch, kind) -> None:
+    from loopcal.diagnose import residual_patterns
+
+    errors = draw_errors(600, 3 if kind == "component" else 9, 4, 0.8)
+    _, data = measure("linear-delta", kind, errors, 4)
+    fit = identify(ROBOTS["linear-delta"], data)
+    whole = adjust_uncertainty(fit, data)
+    monkeypatch.setattr(residual_patterns, "EXAMINED", data.n_rows // 2)
+    monkeypatch.setattr(residual_patterns, "MOST_POSES", 6)  # runs of 50 poses
+    part = adjust_uncertainty(fit, data)
+    found = {f.code: f.data for f in part.findings}
+    assert found["residuals.examined-part"] == {"count": 300 - 49, "rest": 349}
+    ratios = [
+        next(f.data["ratio"] for f in each.findings if f.code == "residuals.correlated")
+        for each in (whole, part)
+    ]
+    assert ratios[0] > 1.1
+    assert abs(ratios[1] - ratios[0]) < 0.2 * (ratios[0] - 1.0)  # of seven seeds, one had 0.39
+    assert "residuals.examined-part" not in {f.code for f in whole.findings}

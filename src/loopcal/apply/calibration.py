@@ -49,7 +49,7 @@ from loopcal.diagnose.picture_errors import (
     measure_picture_errors,
     report_picture_scale,
 )
-from loopcal.diagnose.residual_patterns import CAUSE, POSE
+from loopcal.diagnose.residual_patterns import CAUSE, POSE, linearize_examined
 from loopcal.engine import collect_versions
 from loopcal.errors import DataError, EstimationError
 from loopcal.estimate.determinable_setup import (
@@ -57,7 +57,7 @@ from loopcal.estimate.determinable_setup import (
     report_equal_setup,
     report_fixed_setup,
 )
-from loopcal.estimate.fit_linearization import FitLinearization, linearize_fit
+from loopcal.estimate.fit_linearization import FitLinearization
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.identification import exclude_poses, identify
 from loopcal.estimate.information import count_equations, has_equations_to_spare
@@ -211,7 +211,7 @@ def _explain_residuals(
     """
     linear, drives, explained, pictures = None, None, None, list[Finding]()
     if is_explainable(fit):
-        linear = linearize_fit(fit, split.fitted)
+        linear = linearize_examined(fit, split.fitted)
         explained = explain_residuals(linear)
         drives = measure_drive_errors(linear, explained)
         pictures = [
@@ -303,9 +303,11 @@ def _report(
     examination, budget, given = None, None, (fit, fitted)
     if fit.converged:
         if fit.residual_test.intervals:
-            linear = linearize_fit(*given, linear)
+            linear = linearize_examined(*given, linear)
         examination = examine_fit(*given, count.progress, options.frame, linear)
-        budget = later(lambda: compute_error_budget(*given, options.frame, linear))
+        is_whole = linear is None or linear.data.n_poses == fitted.n_poses
+        whole = linear if is_whole else None
+        budget = later(lambda: compute_error_budget(*given, options.frame, whole))
     volume, of_volume = _bound_volume(fit, errors if held_out is not None else None, options)
     count.begin("looking for further measurements")
     suggestions = None

@@ -47,13 +47,14 @@ from loopcal.diagnose.residual_patterns import (
     estimate_correlated_errors,
     estimate_sizes,
     has_time,
+    linearize_examined,
     test_correlation,
     test_effect,
 )
 from loopcal.diagnose.residual_patterns import LEVEL as CORRELATED
 from loopcal.diagnose.residual_patterns import MOST_POSES as EVEN_CHOICE
 from loopcal.estimate.false_alarms import FALSE_ALARMS
-from loopcal.estimate.fit_linearization import FitLinearization, linearize_fit
+from loopcal.estimate.fit_linearization import FitLinearization
 from loopcal.estimate.posterior import NOISE
 from loopcal.estimate.residual_test import choose_severity
 from loopcal.estimate.result import Identification, add_covariance
@@ -95,7 +96,12 @@ def adjust_uncertainty(
     """
     if not is_explainable(fit):
         return fit
-    linear = linearize_fit(fit, data, linear)
+    linear = linearize_examined(fit, data, linear)
+    share = linear.data.n_poses / data.n_poses
+    if share < 1.0:
+        count, rest = linear.data.n_poses, data.n_poses - linear.data.n_poses
+        finding = report_finding("residuals.examined-part", count=count, rest=rest)
+        fit = replace(fit, findings=(*fit.findings, finding))
     data = linear.data
     if explained is None:
         explained = explain_residuals(linear)
@@ -109,7 +115,7 @@ def adjust_uncertainty(
     if not any(cause.source == OUTLIERS for cause in explained.causes[:1]):  # like any error
         slow = find_slow_errors(linear, T, min([slow_p_value, *named]))
     if explained.rows is not None:
-        fit = _add_patterns(fit, linear, explained, slow)
+        fit = _add_patterns(fit, linear, explained, slow, share)
     return fit if slow is None else add_slow_errors(fit, slow)
 
 
@@ -123,10 +129,11 @@ def _add_patterns(
     linear: FitLinearization,
     explained: ExplainedResiduals,
     slow: SlowErrors | None,
+    share: float,
 ) -> Identification:
     """Return a fit whose covariance allows for the causes of its residuals, and for the correlation
-    of neighbors. What slow errors of the poses explain counts once, with these: a dependence on a
-    reading, and the order of rows that follows the places.
+    of neighbors; the rows are of a share of its poses. What slow errors of the poses explain counts
+    once, with these: a dependence on a reading, and the order of rows that follows the places.
     """
     rows, causes, data = explained.rows, explained.causes, linear.data
     assert rows is not None
@@ -173,14 +180,14 @@ def _add_patterns(
     for cause in shared:
         assert cause.effect is not None
         assert cause.size is not None
-        # of many poses only some have columns
-        times = max(data.n_poses / EVEN_CHOICE, 1.0) if cause.source == POSE else 1.0
+        # of many poses only some have columns, and errors of more of them cancel
+        times = share * max(data.n_poses / EVEN_CHOICE, 1.0) if cause.source == POSE else 1.0
         size = np.sqrt(times * cause.size.variance)
         root = rows.root @ (rows.gain.T @ cause.effect.scaled) * size
         finding = _report_shared(cause, _measure_growth(tool, root))
         fit = add_covariance(fit, root, cause.size.degrees, finding)
     if is_correlated:
-        fit = _add_correlation(fit, left, p_value, data, tool)
+        fit = _add_correlation(fit, left, p_value, data, tool, share)
     return _without_doubt_of_sigma(fit)
 
 
@@ -221,8 +228,11 @@ def _add_correlation(
     p_value: float,
     data: Measurements,
     tool: Sequence[tuple[FloatArray, float]],
+    share: float,
 ) -> Identification:
-    """Return a fit with what correlated errors add to the covariance by independent ones."""
+    """Return a fit with what correlated errors add to the covariance by independent ones; the rows
+    are of this share of its poses.
+    """
     errors = estimate_correlated_errors(rows, fit.residual_test.sigma_degrees)
     independent = np.diag(np.full(len(errors.covariance), fit.residual_test.sigma_scale**2))
     k = len(independent) - len(fit.nuisance)
@@ -233,7 +243,7 @@ def _add_correlation(
         by_noise = np.linalg.lstsq(directions, scaled, rcond=None)[0]
         independent[:k, :k] += by_noise @ by_noise.T
     # what correlated errors cause beyond independent ones, where that is more
-    covariance = errors.covariance
+    covariance = share * errors.covariance
     more = take_root(covariance - independent, np.diag(covariance + independent))
     root = rows.root @ more
     finding = report_finding(
@@ -358,7 +368,7 @@ def check_heavy_tails(
     reported = (f for f in fit.findings if f.severity is Severity.WARNING)
     if any(f.code.startswith(PATTERNS) for f in reported):
         return HeavyTails()
-    linear = linearize_fit(fit, data, linear)
+    linear = linearize_examined(fit, data, linear)
     rows = collect_residual_rows(linear)
     if rows is None:
         return HeavyTails()

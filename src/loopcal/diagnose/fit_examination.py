@@ -21,10 +21,10 @@ from loopcal.diagnose.error_frames import (
 from loopcal.diagnose.model_discrepancy import LackOfFit, check_lack_of_fit
 from loopcal.diagnose.outliers import OutlierCheck, find_outliers
 from loopcal.diagnose.picture_errors import ZOOMED, find_swapped_pictures, measure_picture_errors
-from loopcal.diagnose.residual_patterns import CAUSE
+from loopcal.diagnose.residual_patterns import CAUSE, linearize_examined
 from loopcal.diagnose.value_comparison import compare_with_truth
 from loopcal.errors import EstimationError
-from loopcal.estimate.fit_linearization import FitLinearization, linearize_fit
+from loopcal.estimate.fit_linearization import FitLinearization
 from loopcal.estimate.identification import identify
 from loopcal.estimate.penalties import LeastSquares
 from loopcal.estimate.residual_test import FEWEST_DEGREES, SIGNIFICANCE
@@ -224,7 +224,7 @@ def examine_fit(
     sizes: list[Finding] = []
     progress(0, 1, "testing for heavy tails")
     if fit.converged and fit.residual_test.intervals:
-        linear = linearize_fit(fit, data, linear)
+        linear = linearize_examined(fit, data, linear)
     known = [f for f in fit.findings if f.code == CAUSE]
     if outliers.suspects and not known and linear is not None:
         explained = explain_residuals(linear, is_doubted=True)

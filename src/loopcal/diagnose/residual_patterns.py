@@ -24,9 +24,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loopcal.estimate.false_alarms import FALSE_ALARMS
-from loopcal.estimate.fit_linearization import FitLinearization
+from loopcal.estimate.fit_linearization import FitLinearization, linearize_fit
+from loopcal.estimate.identification import prepare_fitted_data
 from loopcal.estimate.linearization import Linearization, PoseSolution
 from loopcal.estimate.problem import Problem
+from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, Severity, report_finding
 from loopcal.frozen_dataclass import dataclass, replace
 from loopcal.measure.kinds.kind import Kind
@@ -178,6 +180,31 @@ def _decompose_columns(scaled: FloatArray) -> FloatArray:
     return np.asarray(u[:, s > EXPLAINED])
 
 
+def linearize_examined(
+    fit: Identification, data: Measurements, linear: FitLinearization | None = None
+) -> FitLinearization:
+    """Linearize the rows of a fit as `linearize_fit`; of exact readings and more than `EXAMINED`
+    residuals those of a part of the poses, as if it had been made from these: `MOST_POSES` runs in
+    their order, evenly chosen, that determine the same setup parameters.
+    """
+    if linear is not None:
+        known = linear.fit
+        fit = replace(fit, pose_weights=known.pose_weights, options=known.options)
+        return linear._replace(fit=fit)
+    prepared = prepare_fitted_data(fit, data)
+    if prepared.n_rows <= EXAMINED or fit.poses is not None:
+        return linearize_fit(fit, data)
+    first = choose_evenly(data.n_poses, MOST_POSES)
+    length = max(EXAMINED * data.n_poses // (prepared.n_rows * len(first)), 1)
+    poses = find_distinct(np.minimum(first[:, None] + np.arange(length), data.n_poses - 1).ravel())
+    part = prepared.take(poses)
+    if part.nuisance_parameters.table.names != prepared.nuisance_parameters.table.names:
+        return linearize_fit(fit, data)
+    options = replace(fit.options, excluded_poses=())  # their rows have no weight
+    weights = fit.pose_weights[poses]
+    return linearize_fit(replace(fit, options=options, pose_weights=weights), part)
+
+
 class StackedRows(NamedTuple):
     """R rows of a problem, those of one series (a kind and its column) in order."""
 
@@ -286,6 +313,7 @@ CAUSE = "residuals.cause"  # code of the finding on the cause of residuals
 CHUNK = 32  # columns that are multiplied together
 MOST_POSES = 100  # poses that show an effect well enough, evenly chosen of more
 MOST_VALUES, FEWEST_POSES = 6000, 30  # values of these, and poses that they need at least
+EXAMINED = 120_000  # residuals that are examined at most: more would show the same
 
 
 @dataclass(frozen=True, eq=False)

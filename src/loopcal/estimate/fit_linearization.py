@@ -42,6 +42,8 @@ from loopcal.numerics.elimination import eliminate_columns
 from loopcal.numerics.statistics import find_distinct
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
+MOST_KEPT = 50_000_000  # derivatives of poses that are kept for the rows of a fit, at most
+
 
 class FitLinearization(NamedTuple):
     """The problem of a fit at its estimate, weighted as in the fit (t = 1).
@@ -162,7 +164,8 @@ def linearize_at_estimate(
     if problem.nuisance is not None:
         start = start.with_nuisance(fit.nuisance.estimate[None])
     if solution is None:
-        solution = problem.solve(z, start, derivatives=True)
+        kept = 6 * data.n_poses * len(problem.free) <= MOST_KEPT  # or computed when needed
+        solution = problem.solve(z, start, derivatives=kept)
     else:
         problem = replace(problem, consistent=None)
     linearization = problem.linearize_at(z, start, solution)

@@ -18,6 +18,7 @@ from bisect import bisect_right
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from decimal import Decimal, InvalidOperation
+from functools import cache
 from itertools import accumulate, chain, takewhile
 from pathlib import Path
 from typing import Any
@@ -48,7 +49,7 @@ def parse_decimals(cells: Sequence[str], factor: float) -> FloatArray:
     """Return products of finite numbers (n,) with a factor, each rounded once as by `parse_exact`;
     NaN for other cells.
     """
-    exact = Decimal(repr(factor)).normalize()
+    exact = _as_decimal(factor)
     _, digits, exponent = exact.as_tuple()
     text = "".join(cells)
     is_plain = text.isascii() and "_" not in text
@@ -73,8 +74,15 @@ def _keep_finite(values: FloatArray) -> FloatArray:
 
 # Numbers as text: the fewest digits that read back as the same double.
 
-DIGITS = range(12, 18)
-"""Significant digits that are tried, fewest first; 17 always suffice for one double."""
+DIGITS = range(15, 18)
+"""Significant digits that are tried, fewest first; 17 always suffice for one double. A number of
+fewer than 15 that reads back is the nearest one of 15, whose zeros at the end are not written.
+"""
+
+
+@cache
+def _as_decimal(factor: float) -> Decimal:
+    return Decimal(repr(factor)).normalize()
 
 
 def format_scaled(value: float, factor: float) -> str:
@@ -87,23 +95,25 @@ def format_scaled(value: float, factor: float) -> str:
 
 
 def format_exact(value: float, factor: float) -> str:
-    """Return the shortest text (12 to 17 digits) from which `parse_exact` makes the same double.
+    """Return the shortest text (up to 17 digits) from which `parse_exact` makes the same double.
 
     17 digits suffice for every double: rounding to them changes a number by at most 0.5e-16 of it,
     and half the distance of two doubles is at least 0.55e-16 of them.
     """
-    scaled = Decimal(value) / Decimal(repr(factor))
-    texts = (f"{float(scaled):.{digits}g}" for digits in DIGITS)
+    scaled = Decimal(value) / _as_decimal(factor)
+    number = float(scaled)
+    for digits in DIGITS:
+        if parse_exact(text := f"{number:.{digits}g}", factor) == value:
+            return text
     # rounded once: through a double, the last digit may be that of a neighbor
-    nearest = f"{scaled:.{DIGITS[-1]}g}"
-    return next((text for text in texts if parse_exact(text, factor) == value), nearest)
+    return f"{scaled:.{DIGITS[-1]}g}"
 
 
 def parse_exact(text: str, factor: float) -> float:
     """Return the double nearest to the decimal product of a text and a factor, rounded once;
     decimal.InvalidOperation for other text.
     """
-    return float(Decimal(text) * Decimal(repr(factor)))
+    return float(Decimal(text) * _as_decimal(factor))
 
 
 def parse_finite(text: str) -> float | None:
@@ -367,6 +377,10 @@ def format_header(units: Mapping[str, str | None]) -> tuple[str, ...]:
 
 def format_row(cells: Iterable[str]) -> str:
     """Return a line of cells, in quotes where one contains a comma, a quote or a number sign."""
+    cells = tuple(cells)
+    line = ",".join(cells)
+    if '"' not in line and "#" not in line and line.count(",") == max(len(cells) - 1, 0):
+        return line
     return ",".join(
         '"' + cell.replace('"', '""') + '"' if any(c in cell for c in ',"#') else cell
         for cell in cells

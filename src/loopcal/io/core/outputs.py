@@ -31,7 +31,7 @@ from loopcal.io.core.replacement import (
 )
 from loopcal.io.core.text_file import (
     convert_document,
-    format_content,
+    iterate_content,
     read_json,
     report_write_errors,
     resolve_links,
@@ -242,11 +242,12 @@ def write_result_folder(
     path: Path,
     kind: FolderKind,
     document: Mapping[str, Any],
-    files: Mapping[str, bytes],
+    files: Mapping[str, bytes | Callable[[Path], object]],
     force: bool = False,
 ) -> None:
-    """Write a folder whole or not at all: `files` by name, and the document with their digests;
-    FileError as `refuse_folder`, or where the folder cannot be written.
+    """Write a folder whole or not at all: `files` by name, as bytes or as a function that writes
+    them, and the document with their digests; FileError as `refuse_folder`, or where the folder
+    cannot be written.
     """
     digests = dict.fromkeys((*sorted(files), kind.document), _BLANK)
     computed = convert_document({**document, FILES: digests})
@@ -256,12 +257,17 @@ def write_result_folder(
         for name, content in files.items():
             file = folder / name
             file.parent.mkdir(exist_ok=True)
-            file.write_bytes(content)
+            if isinstance(content, bytes):
+                file.write_bytes(content)
+            else:
+                content(file)
         written = digests | {name: sha256(folder / name) for name in files}
-        text = format_content({**computed, FILES: written})
-        digest = hashlib.sha256(text.encode()).hexdigest()
-        text = text.replace(_quote(kind, _BLANK), _quote(kind, digest))
-        (folder / kind.document).write_bytes(text.encode())
+        digest = hashlib.sha256()
+        for part in iterate_content({**computed, FILES: written}):
+            digest.update(part.encode())
+        written[kind.document] = digest.hexdigest()
+        with (folder / kind.document).open("wb") as stream:
+            stream.writelines(map(str.encode, iterate_content({**computed, FILES: written})))
 
 
 def describe_leftover(path: Path, document: str) -> str:

@@ -15,6 +15,7 @@ import stat
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from io import BufferedReader
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -217,6 +218,9 @@ def _reason(error: OSError) -> str:
 
 # JSON text without NaN.
 
+PIECES = 10_000
+"""Pieces of JSON text, such as a number, that are put together at once."""
+
 LONGEST_WHOLE = 400
 """Digits of a whole number that are read; a double has 309."""
 
@@ -228,7 +232,7 @@ def to_json(document: Mapping[str, Any]) -> str:
     A number that is not finite becomes null. The key `nulls` then maps its place, such as
     `parameters/3/plus_minus`, to the reason.
     """
-    return format_content(convert_document(document))
+    return "".join(iterate_content(convert_document(document)))
 
 
 def convert_document(document: Mapping[str, Any]) -> dict[str, Any]:
@@ -238,9 +242,12 @@ def convert_document(document: Mapping[str, Any]) -> dict[str, Any]:
     return {**content, "nulls": nulls} if nulls else content
 
 
-def format_content(content: Mapping[str, Any]) -> str:
-    """Return the JSON text of what `convert_document` returns."""
-    return escape_json(json.dumps(content, indent=2, allow_nan=False, ensure_ascii=False)) + "\n"
+def iterate_content(content: Mapping[str, Any]) -> Iterator[str]:
+    """Yield the JSON text of what `convert_document` returns, part by part."""
+    pieces = json.JSONEncoder(indent=2, allow_nan=False, ensure_ascii=False).iterencode(content)
+    while part := "".join(islice(pieces, PIECES)):
+        yield escape_json(part)
+    yield "\n"
 
 
 def read_json(path: str | Path, what: str, action: str, limit: FileLimit = PROGRAM_SIZE) -> Any:

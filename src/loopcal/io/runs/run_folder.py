@@ -14,7 +14,6 @@ robot.yaml     the corrected robot file: the nominal file plus its `identified:`
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -338,8 +337,11 @@ def write_run_folder(
     FAILED_ROBOT.
     """
     path = as_path(path, "run folder")
-    np.savez(stream := BytesIO(), allow_pickle=False, **arrays)
-    files = {robot_name: robot_text.encode(), ARRAYS: stream.getvalue()}
+
+    def write_arrays(file: Path) -> None:
+        np.savez(file, allow_pickle=False, **arrays)
+
+    files = {robot_name: robot_text.encode(), ARRAYS: write_arrays}
     write_result_folder(path, RUN, result, files, force)
     return path
 
