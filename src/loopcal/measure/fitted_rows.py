@@ -26,6 +26,7 @@ SAME_READING = 1e-5  # the same for readings of rows whose measured values decid
 # of it, in standard deviations of the noise, and by less than the largest difference.
 CHANCE, LARGEST = 1e-6, 1e-2
 ENOUGH = 3  # equal values by which rows of different kinds are the same
+FEW = 200_000  # numbers that are compared pair by pair
 ALONE = "readings"  # stands for the kind of rows that have readings alone
 PREFIX = "fitted"  # first word of the names of the stored arrays
 
@@ -131,8 +132,6 @@ def _agree(
     rows: ComparedRows, own: np.ndarray, stored: FloatArray, common: BoolArray, span: FloatArray
 ) -> BoolArray:
     """Return which of the rows `own` agree with a stored row in the `common` columns (c,)."""
-    from scipy.spatial import KDTree
-
     m = int(common[rows.readings :].sum())
     if m == 0 and rows.content.shape[1] > rows.readings:
         return np.zeros(len(own), dtype=bool)
@@ -141,9 +140,12 @@ def _agree(
         share[: rows.readings] = SAME_READING
     noise = np.median(rows.noise[own], axis=0)
     limit = np.maximum(share * span, min(CHANCE ** (1.0 / max(m, 1)), LARGEST) * noise)[common]
-    distance, _ = KDTree(stored[:, common] / limit).query(
-        rows.content[own][:, common] / limit, p=np.inf, distance_upper_bound=1.0
-    )
+    mine, theirs = rows.content[own][:, common] / limit, stored[:, common] / limit
+    if 0 < mine.size * len(theirs) <= FEW:  # sooner than the import of a search tree
+        return (np.abs(mine[:, None] - theirs).max(axis=2) < 1.0).any(axis=1)
+    from scipy.spatial import KDTree
+
+    distance, _ = KDTree(theirs).query(mine, p=np.inf, distance_upper_bound=1.0)
     return np.isfinite(distance)
 
 
