@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Calibrate a linear delta from a file of a million rows as a user does, and keep what it took.
+"""Calibrate a hexapod from a file of a million poses as a user does, and keep what it took.
 
-Run as `python -m benchmarks.many_rows [ROWS]`, from the root; a million rows take about seven
+Run as `python -m benchmarks.many_rows [ROWS]`, from the root; a million rows take about two
 minutes of one core. benchmarks/many_rows.json keeps rows, CPU seconds, peak memory and the machine.
 """
 
@@ -15,36 +15,40 @@ from pathlib import Path
 
 import numpy as np
 
+from loopcal.geometry import log_so3
 from loopcal.io.robot.robot_file import load_robot
 from loopcal.measure.simulation import sample_truth
 from loopcal.mechanism.solutions import forward, inverse
 from tools.machine import describe_machine
 
 RESULT = Path(__file__).resolve().parent / "many_rows.json"
-ROBOT, SIGMA = "linear-delta", 10e-6
-HEAD = """# kind: component
-# components: [x, y, z]
-# noise: {x: 10 um, y: 10 um, z: 10 um}
-pose,q1 [mm],q2 [mm],q3 [mm],x [mm],y [mm],z [mm]
+ROBOT, SIGMA = "hexapod-42", np.array([50e-6] * 3 + [10e-6] * 3)
+HEAD = """# kind: pose
+# noise: {"r*": 50 urad, x: 10 um, y: 10 um, z: 10 um}
 """
+COLUMNS = [*(f"q{i} [mm]" for i in range(1, 7)), "rx [mrad]", "ry [mrad]", "rz [mrad]"]
+COLUMNS += ["x [mm]", "y [mm]", "z [mm]"]
+LARGEST = 0.0749  # of a reading [m], just inside the stroke
 
 
 def write_rows(path: Path, count: int) -> None:
-    """Write positions of a machine drawn from the tolerances, all over its workspace."""
+    """Write poses of a machine drawn from the tolerances, all over its workspace."""
     robot = load_robot(ROBOT)
     truth = robot.with_values(sample_truth(robot, 1, 0)[0])
     ranges = np.array([robot.assembly.workspace[name] for name in robot.controlled])
     rng = np.random.default_rng(0)
     with path.open("w", encoding="utf-8", newline="\n") as file:
-        file.write(HEAD)
-        for begin in range(0, count, 10_000):
-            n = min(10_000, count - begin)
-            commanded = rng.uniform(ranges[:, 0], ranges[:, 1], (n, len(ranges)))
+        file.write(HEAD + ",".join(["pose", *COLUMNS]) + "\n")
+        written = 0
+        while written < count:
+            commanded = rng.uniform(ranges[:, 0], ranges[:, 1], (10_000, len(ranges)))
             q = inverse(robot, commanded).q
-            place = forward(truth, q).T[:, :3, 3] + rng.normal(0.0, SIGMA, (n, 3))
-            for i, (reading, at) in enumerate(zip(1e3 * q, 1e3 * place, strict=True)):
-                cells = [*(f"{v:.6f}" for v in reading), *(f"{v:.4f}" for v in at)]
-                file.write(f"p{begin + i + 1},{','.join(cells)}\n")
+            q = q[(np.abs(q) < LARGEST).all(axis=1)][: count - written]
+            T = forward(truth, q).T
+            at = np.hstack([log_so3(T[:, :3, :3]), T[:, :3, 3]]) + rng.normal(0.0, SIGMA, q.shape)
+            for cells in (1e3 * np.hstack([q, at])).tolist():
+                written += 1
+                file.write(f"p{written}," + ",".join(f"{v:.6f}" for v in cells) + "\n")
 
 
 def measure_calibration(count: int) -> dict[str, object]:

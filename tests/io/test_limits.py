@@ -272,9 +272,9 @@ def test_lines_without_rows_are_counted_before_they_are_split(tmp_path) -> None:
 
 
 def test_values_of_json_text_are_counted_before_they_are_parsed(tmp_path) -> None:
-    path = write(tmp_path, "[" + "[]," * 6_000_000 + "1]", "result.json")
+    path = write(tmp_path, "[" + "[]," * 13_000_000 + "1]", "result.json")
     begin = time.process_time()
-    with pytest.raises(FileError, match=r"has 12,000,001 values, but the limit is 10,000,000"):
+    with pytest.raises(FileError, match=r"has 26,000,001 values, but the limit is 25,000,000"):
         read_json(path, "run result", "repeat", limits.TABLE_SIZE)
     assert time.process_time() - begin < 2.0
 

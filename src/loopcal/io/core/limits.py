@@ -193,7 +193,7 @@ PROGRAM_SIZE = FileLimit(
 )
 JSON_VALUES = FileLimit(
     "values in JSON text",
-    10_000_000,
+    25_000_000,
     "values",
     "`result.json` of a run, samples of a cable robot; keys included",
     "check that this is the file that was meant",
