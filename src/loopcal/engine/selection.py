@@ -193,8 +193,9 @@ def solve(
     that constrain the platform: a limb whose joints only follow it may pass its own singularities.
     """
     current = _get_engine_for(program, sums)
-    given = () if sums is None else (sums,)
-    q = q if sums is None else program.list_drives(start.joints)
+    given: tuple[Sums, ...] = ()
+    if sums is not None:
+        given, q = (sums,), program.list_drives(start.joints)
     state = current.solve(program, e, q, start, task, free, max_iterations, goal, *given)
     if not program.idle_groups:
         return state
