@@ -7,6 +7,7 @@ frame of a tracker that stands two meters away.
 
 import csv
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -260,6 +261,14 @@ def test_a_point_far_from_its_place_is_reported(robot, sheet, points, tmp_path) 
     (found,) = examine(robot, sheet, write_spatial_analyzer(tmp_path / "e.txt", far))
     assert found.code == "sheet.points-far"
     assert "4_SMR2 by 34.6 mm" in str(found)
+
+
+def test_points_at_poses_that_the_robot_does_not_reach_are_not_examined(
+    robot, sheet, points, tmp_path
+) -> None:
+    data = fill(robot, sheet, write_spatial_analyzer(tmp_path / "e.txt", points)).data
+    away = replace(data, readings=data.readings + 1e3 * np.arange(1.0, 7.0))  # [m]
+    assert examine_points(robot, away, "mm") == ()
 
 
 def test_moved_tracker_is_refused_and_two_files_are_two_sessions(

@@ -51,6 +51,8 @@ def examine_points(robot: Mechanism, data: Measurements, unit: str) -> tuple[Fin
             continue
         for session in np.unique(rows.session):
             chosen = np.flatnonzero((rows.session == session) & solution.converged[rows.rows])
+            if chosen.size == 0:  # no pose whose points could be predicted
+                continue
             poses = rows.rows[chosen]
             points = rows.measured[chosen].reshape(len(chosen), len(rows.kind.targets), 3)
             labels = [data.labels[i] for i in poses]
