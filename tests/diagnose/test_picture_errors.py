@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from loopcal import geometry, identifiability, identify, load_robot
+from loopcal import calibrate, geometry, identifiability, identify, load_robot
 from loopcal.diagnose.error_causes import explain_residuals
 from loopcal.diagnose.picture_errors import (
     find_print_scale,
@@ -155,3 +155,15 @@ def test_size_of_a_machine_that_only_pictures_measure_follows_from_the_board() -
         robot, Instrument((Sensor(kind, Gaussian(np.full(2, SIGMA))),)), poses=12
     )
     assert "identifiability.board-scale" not in [f.code for f in of_rods.findings]
+
+
+@pytest.mark.slow
+def test_calibration_names_swapped_pictures() -> None:
+    def swap(rows, _):
+        place = np.arange(16)
+        place[[4, 11]] = 11, 4
+        return replace(rows, rows=place[rows.rows])
+
+    report = calibrate(*change(swap))
+    found = [f.data["shown"] for f in report.findings if f.code == "outliers.swapped-picture"]
+    assert found == ["12", "5"]

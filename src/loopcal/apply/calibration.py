@@ -46,6 +46,7 @@ from loopcal.diagnose.model_discrepancy import find_dense_regions
 from loopcal.diagnose.outliers import find_outliers
 from loopcal.diagnose.picture_errors import (
     find_print_scale,
+    find_swapped_pictures,
     measure_picture_errors,
     report_picture_scale,
 )
@@ -332,6 +333,7 @@ def _report(
     findings = [
         # fit and validation answer doubts about conventions
         *(replace(finding, severity=Severity.INFO) for finding in doubts),
+        *(s for f in doubts for s in find_swapped_pictures(fit, fitted, f.data.get("poses", ()))),
         *report_fit(fit),
         *report_unexplained(fit, examined),
         *impossible,
