@@ -289,7 +289,10 @@ class StudyStore:
         rows = [row for (row,) in self.ask(question, width)]
         self.connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, usual)
         question = f"SELECT levels, block {WITH_CELLS} WHERE blocks.rowid = ?"
-        return {row: _name_block(*next(self.ask(question, row))) for row in rows}
+        found = {row: next(self.ask(question, row), None) for row in rows}
+        if None in found.values():  # an index lists rows that the table does not have
+            raise FileError(report_finding("store.damaged"), self.path)
+        return {row: _name_block(*names) for row, names in found.items() if names}
 
     def remove_damaged(self) -> tuple[str, ...]:
         """Remove all damaged blocks, which are then computed again, and return their names."""
