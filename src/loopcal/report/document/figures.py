@@ -180,8 +180,8 @@ def draw_budget_picture(record: CalibrationRecord) -> Iterator[Element]:
             partial(draw_budget_sources, budget),
             "budget-figure",
             "Expected error by source.",
-            "A bar is the part of one source in the root mean square error. A diamond is the whole "
-            "error after halving the sigma of this source.",
+            "A bar is the part of a source in the root mean square error; a diamond is the error "
+            "of all sources if the sigma of this one were half as large.",
         )
 
 

@@ -339,8 +339,8 @@ class PageAxis:
     @property
     def limits(self) -> tuple[float, float]:
         """Both ends of the axis."""
-        values = [v for v in self.values if v > 0.0 or self.decades is None]
-        low, high = min(values, default=0.1), max(values, default=1.0)
+        values = [v for v in self.values if v > 0.0 or self.decades is None] or [0.0, 1.0]
+        low, high = min(values), max(values)
         if self.decades is not None:
             low, high = math.log10(low), math.log10(high)
         room = self.margin * (high - low) or 0.05 * max(abs(high), 0.02)
@@ -513,8 +513,7 @@ class PageAxes:
             left, top, width, height = self.box
             x, y = (float(v) for v in self.place(*((np.nan, value), (value, np.nan))[axis]))
             d = (f"M{left:.2f} {y:.2f}h{width:.2f}", f"M{x:.2f} {top:.2f}v{height:.2f}")[axis]
-            if math.isfinite((y, x)[axis]):  # zero is nowhere on a logarithmic axis
-                yield draw_path(d, style)
+            yield draw_path(d, style)
 
         self._add(draw, zorder)
 
@@ -544,8 +543,6 @@ class PageAxes:
             a = np.array([[left, left + width]]) if x is None else self.place(x, 0.0)[0]
             b = np.array([[top + height, top]]) if y is None else self.place(0.0, y)[1]
             for (x1, x2), (y1, y2) in zip(a.tolist(), b.tolist(), strict=True):
-                if not math.isfinite(x1 + x2 + y1 + y2):
-                    continue
                 yield _write(
                     "rect", x=f"{min(x1, x2):.2f}", y=f"{min(y1, y2):.2f}",
                     width=f"{abs(x2 - x1):.2f}", height=f"{abs(y2 - y1):.2f}", fill=fill,
@@ -649,8 +646,6 @@ class PageAxes:
             x, y = (float(v) for v in self.place(*xy))
             y = y if xycoords == "data" else self.box[1] + self.box[3] * (1.0 - xy[1])
             x, y = x + xytext[0], y - xytext[1]
-            if not math.isfinite(x + y):
-                return
             if "bbox" in how:
                 width = measure_text(text, size) + 2.0
                 yield _write(
