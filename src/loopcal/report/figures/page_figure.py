@@ -139,7 +139,7 @@ class Style(NamedTuple):
     face: str
     edge: str
     width: float
-    line: str | tuple[float, tuple[float, ...]]  # a word, or an offset and dashes
+    line: str
     marker: str
     size: float
     edge_width: float
@@ -189,8 +189,8 @@ def _write(tag: str, text: str | None = None, **attributes: Any) -> str:
 
 def draw_path(d: str, style: Style) -> str:
     """Return the line of a style along a path."""
-    dashes = DASHES.get(style.line, ()) if isinstance(style.line, str) else style.line[1]
-    dashed = " ".join(f"{dash * style.width:.2f}" for dash in dashes) or None
+    dashes = style.line if isinstance(style.line, tuple) else (0, DASHES.get(style.line))
+    dashed = dashes[1] and " ".join(f"{dash * style.width:.2f}" for dash in dashes[1])
     opacity = None if style.alpha == 1.0 else style.alpha
     cap = None if style.cap == "butt" else style.cap
     return _write(
@@ -634,11 +634,17 @@ class PageAxes:
         self._add(draw, 0.0)
         return scale
 
-    def annotate(self, text: str, xy: Any, *where: Any, **how: Any) -> None:
+    def annotate(
+        self,
+        text: str,
+        xy: Any,
+        xytext: Any = (0.0, 0.0),
+        xycoords: Any = "data",
+        *_: Any,
+        **how: Any,
+    ) -> None:
         """Write a text at a value, moved by points; with other coordinates, at a share of y."""
-        usual: tuple[Any, ...] = ((0.0, 0.0), "data")
-        xytext, xycoords = (*where, *usual[len(where) :])[:2]
-        size, place = how.get("fontsize", TITLE_SIZE), dict[str, Any](ha="left", va="baseline")
+        size, place = how.get("fontsize", TITLE_SIZE), {"ha": "left", "va": "baseline"}
         place |= {key: how[key] for key in ("ha", "va", "rotation") if key in how}
         place["color"] = name_color(how.get("color", BLACK))
 
@@ -1062,9 +1068,8 @@ class SpaceAxes(PageAxes):
 
         def draw() -> Iterator[str]:
             a, b = (float(v[0]) for v in self.locate(x, y, z))
-            yield from draw_text(
-                a + GAP, b, text.strip(), fontsize, ha="left", va="bottom", color=color
-            )
+            how = {"ha": "left", "va": "bottom", "color": color}
+            yield from draw_text(a + GAP, b, text.strip(), fontsize, **how)
 
         self._add(draw, zorder, is_clipped=False)
 
@@ -1134,9 +1139,9 @@ class SpaceAxes(PageAxes):
             out *= 1.0 if out @ (0.5 * (first + last) - center) > 0.0 else -1.0
             at = np.array(self.locate(*edge.T)).T + 1.3 * TICK_SIZE * out
             for place, label in zip(at.tolist(), ticks.labels, strict=True):
-                words += draw_text(place[0], place[1], label, TICK_SIZE - 1.0)
+                words += draw_text(*place, label, TICK_SIZE - 1.0)
             at = 0.5 * (first + last) + 3.2 * TICK_SIZE * out
-            words += draw_text(float(at[0]), float(at[1]), self.ends[axis].label, LABEL_SIZE)
+            words += draw_text(*at.tolist(), self.ends[axis].label, LABEL_SIZE)
         yield _write("path", d="".join(lines), stroke=GRID_COLOR, stroke_width=0.3)
         for _, _, draw in sorted(self.items, key=lambda item: item[0]):
             yield from draw()
