@@ -47,8 +47,8 @@ from loopcal.version import __version__
 # Records of calibrations from reports in memory and from run folders, with controllers'
 # values.
 
-GENERAL = ("json", "csv")
-"""Formats that take every robot, and belong to no controller."""
+GENERAL = ("json", "csv", "c", "linuxcnc-kinematics")
+"""Formats that take every robot and belong to no controller, and programs, which nobody types."""
 
 
 def load_record(

@@ -15,6 +15,7 @@ import pytest
 
 import loopcal as lc
 from loopcal.cli.entry_point import main
+from loopcal.report.pictures import _render_svg
 from tests.findings.expectations import expect_refusal
 
 DRAW = "--draw 16 --kind position --sigma-position 10um"
@@ -195,6 +196,7 @@ def read_policy(text: str) -> str:
 
 
 def test_page_shows_the_comparison_without_programs_and_requests(loopcal, monkeypatch) -> None:
+    monkeypatch.setattr("loopcal.report.pictures._render_svg", _render_svg)  # drawn, not left out
     assert loopcal("may june july -o page.html", "Written to page.html").err == ""
     text = Path("page.html").read_text("utf-8")
     headings = re.findall(r'<h2 id="([a-z]+)">', text)

@@ -73,7 +73,6 @@ UNUSED = {
 DATA = str(Path("examples/hexapod-42/measurements.csv").resolve())
 COMMANDS = {
     "calibrate": (["calibrate", "hexapod-42", DATA, "-o", "run", "--hold-out", "0.25"], set()),
-    "report": (["report", "run", "-o", "page.html"], UNUSED - {"matplotlib", "rich", "msgspec"}),
     "check": (["check", "hexapod-42"], set()),
     "identifiability": (["identifiability", "hexapod-42"], set()),
     "simulate": (["simulate", "hexapod-42", "-o", "simulated.csv"], set()),

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 import loopcal as lc
 from loopcal.cli.entry_point import main
@@ -22,7 +23,6 @@ from loopcal.report.document import figures
 from loopcal.report.document.calibration_document import build_calibration_document, build_sections
 from loopcal.report.document.elements import Document, Picture, render_html
 from loopcal.report.document.figures import thin_rows
-from loopcal.report.figures.style import finish_figure, start_figure
 from loopcal.report.scene.scene import load_script
 from loopcal.report.validation_view import READING_NOISE, view_errors
 from loopcal.results.tables import Table
@@ -317,10 +317,9 @@ def test_a_decorated_function_adds_a_figure_to_its_section(run, monkeypatch) -> 
 
     @figures.report_figure("poses")
     def draw_count(record):
-        def draw():
-            return finish_figure(start_figure(4.0, 3.0), f"{len(record.fitted_labels)} poses")
-
-        yield figures.make_picture(draw, "count-figure", "Number of poses.", "It is a number.")
+        figure = Figure()
+        figure.suptitle(f"{len(record.fitted_labels)} poses")
+        yield figures.make_picture(figure, "count-figure", "Number of poses.", "It is a number.")
 
     (section,) = build(load_record(run), "poses").sections
     *_, picture = section.elements

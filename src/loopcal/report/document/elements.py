@@ -38,7 +38,7 @@ class Picture:
 
     Parameters
     ----------
-    name : prefix of its identifiers. svg : see `PageFigure.write_svg`. caption : shown below it.
+    name : prefix of its identifiers. svg : see `inline_figure`. caption : shown below it.
     description : what it shows, for readers who do not see it.
     scene : JSON of a scene, which replaces the figure where a browser has WebGL; empty without.
     """

@@ -5,8 +5,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from functools import lru_cache, partial
-from typing import TYPE_CHECKING, Any
+from functools import lru_cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -28,7 +28,7 @@ from loopcal.report.figures.result_figures import (
     draw_validation,
 )
 from loopcal.report.figures.robot_figure import draw_scene
-from loopcal.report.figures.style import drawing_for_page
+from loopcal.report.pictures import inline_figure
 from loopcal.report.scene.scene import (
     Motion,
     Scene,
@@ -74,12 +74,10 @@ def draw_figures(section: str, record: CalibrationRecord) -> Iterator[Element]:
 
 
 def make_picture(
-    draw: Callable[[], Figure], name: str, caption: str, description: str, scene: str = ""
+    figure: Figure, name: str, caption: str, description: str, scene: str = ""
 ) -> Picture:
-    """Return the figure that a function draws as a picture; see `Picture` for the arguments."""
-    with drawing_for_page():
-        figure: Any = draw()
-    return Picture(name, figure.write_svg(name), caption, description, scene)
+    """Return a figure as a picture; see `Picture` for the arguments."""
+    return Picture(name, inline_figure(figure, name), caption, description, scene)
 
 
 @report_figure("residuals")
@@ -106,7 +104,7 @@ def draw_residual_picture(record: CalibrationRecord) -> Iterator[Element]:
         )
     setup = [row["name"] for row in record.result["fit"].get("local") or ()]
     yield make_picture(
-        partial(draw_residual_rows, record.robot, residuals, setup),
+        draw_residual_rows(record.robot, residuals, setup),
         "residual-figure",
         "Residuals of the fitted rows.",
         "The panels show the residuals in the order of the poses, by component, as "
@@ -144,7 +142,7 @@ def draw_validation_picture(record: CalibrationRecord) -> Iterator[Element]:
         yield f"The errors of {len(errors.poses):,} rows are too many for a figure."
         return
     yield make_picture(
-        partial(draw_validation, errors),
+        draw_validation(errors),
         "validation-figure",
         "Errors at held-out poses before and after calibration.",
         "For each held-out pose the figure shows the size of the error before and after "
@@ -162,7 +160,7 @@ def draw_height_picture(record: CalibrationRecord) -> Iterator[Element]:
         yield f"The errors of {len(heights.poses):,} heights are too many for a figure."
         return
     yield make_picture(
-        partial(draw_height_errors, heights),
+        draw_height_errors(heights),
         "height-figure",
         "Height errors over x and y before and after calibration.",
         "Each point is a measured height at its place x, y; its color is the error, "
@@ -177,7 +175,7 @@ def draw_budget_picture(record: CalibrationRecord) -> Iterator[Element]:
     budget = record.result.get("expected_error")
     if budget and budget.get("sources"):
         yield make_picture(
-            partial(draw_budget_sources, budget),
+            draw_budget_sources(budget),
             "budget-figure",
             "Expected error by source.",
             "A bar is the part of a source in the root mean square error; a diamond is the error "
@@ -211,7 +209,7 @@ def draw_scene_picture(record: CalibrationRecord) -> Iterator[Element]:
         yield f"The 3-D view can show the robot at {in_space:,} of these poses, evenly spread."
     of_map = " Pale squares show the standard uncertainty of positions over the workspace by color."
     yield make_picture(
-        partial(draw_scene, scene),
+        draw_scene(scene),
         "scene-figure",
         "The robot at home, and the tool point at the fitted poses.",
         "A point is the tool at a fitted pose. The line from it is the position error of the "
@@ -262,7 +260,7 @@ def draw_accuracy_picture(record: CalibrationRecord) -> Iterator[Element]:
         f"{count}. Frame: {accuracy.uncertainty.frame}."
     )
     yield make_picture(
-        partial(draw_accuracy_map, accuracy),
+        draw_accuracy_map(accuracy),
         "accuracy-figure",
         "Standard uncertainty of poses over the workspace.",
         "Slices of the workspace show the standard uncertainty of the pose by color. Circles mark "
@@ -296,7 +294,7 @@ def draw_parameter_picture(record: CalibrationRecord) -> Iterator[Element]:
         yield f"{len(rows)} parameters are too many for a figure."
         return
     yield make_picture(
-        partial(draw_parameter_rows, record.robot.name, rows),
+        draw_parameter_rows(record.robot.name, rows),
         "parameter-figure",
         "Shift and uncertainty of the parameters in tolerances.",
         "For each parameter the figure shows the estimate minus the nominal value with its 95 % "
@@ -305,7 +303,7 @@ def draw_parameter_picture(record: CalibrationRecord) -> Iterator[Element]:
     if len(rows) > 1:
         names = [row["name"] for row in rows]
         yield make_picture(
-            partial(draw_correlation_matrix, record.robot.name, names, record.arrays["covariance"]),
+            draw_correlation_matrix(record.robot.name, names, record.arrays["covariance"]),
             "correlation-figure",
             "Correlations of the parameters.",
             "The matrix shows the correlation of each pair of parameters by color.",

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
-from functools import partial
 
 from loopcal.apply.run_comparison import RunComparison
 from loopcal.engine import collect_versions
@@ -75,7 +74,7 @@ def _describe_parameters(comparison: RunComparison) -> Iterator[Element]:
     """Yield estimates with intervals, side by side."""
     yield build_estimates(comparison)
     yield make_picture(
-        partial(draw_run_parameters, comparison),
+        draw_run_parameters(comparison),
         "estimates-figure",
         "Estimates of all runs with their 95 % intervals.",
         "For each parameter the figure shows the estimate of each run minus the first run, with "
@@ -89,7 +88,7 @@ def _describe_shifts(comparison: RunComparison) -> Iterator[Element]:
         yield NO_SHIFTS
         return
     yield make_picture(
-        partial(draw_run_shifts, comparison),
+        draw_run_shifts(comparison),
         "shift-figure",
         "Shift of each parameter from the first run.",
         "For each parameter the figure shows the shift in standard deviations while all others "
@@ -104,7 +103,7 @@ def _describe_errors(comparison: RunComparison) -> Iterator[Element]:
     yield build_errors(comparison)
     if any(run.common or run.own for run in comparison.errors):
         yield make_picture(
-            partial(draw_run_errors, comparison),
+            draw_run_errors(comparison),
             "errors-figure",
             "Errors of each run after calibration.",
             "Bars are root mean squares and dots are the largest errors of each run. Errors at "
@@ -142,7 +141,7 @@ def _draw_home(robot: Mechanism) -> Picture:
     """Return a robot at home."""
     scene = Scene(robot)
     return make_picture(
-        partial(draw_scene, scene),
+        draw_scene(scene),
         "scene-figure",
         "The robot at home.",
         "The picture shows limbs, joints, rods, platform and tool, in space and from above.",

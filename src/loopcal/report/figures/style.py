@@ -8,13 +8,10 @@ markers, lines or labels differ, too.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from contextvars import ContextVar
-from typing import TYPE_CHECKING, Any, cast
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
 
 from loopcal.plain_text import escape
-from loopcal.report.figures.page_figure import Handle, PageAxis, PageFigure, read_style
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -73,29 +70,11 @@ DASHED: dict[str, Any] = {**ZERO, "ls": "--"}
 """Styles of a line at zero, and of a reference that data are compared with."""
 
 
-_IS_PAGE: ContextVar[bool] = ContextVar("is_page", default=False)
-"""Whether figures are drawn for a page."""
-
-
-@contextmanager
-def drawing_for_page() -> Iterator[None]:
-    """Let `start_figure` return figures of pages."""
-    token = _IS_PAGE.set(True)
-    try:
-        yield
-    finally:
-        _IS_PAGE.reset(token)
-
-
 def start_figure(width: float, height: float) -> Figure:
-    """Return an empty figure of this size [inch]: that of a page, or one of matplotlib, which
-    notebooks show without pyplot.
-    """
-    if _IS_PAGE.get():
-        return cast("Figure", PageFigure(width, height))
-    from loopcal.report.figures.notebook_figure import NotebookFigure
+    """Return an empty figure of this size [inch], which notebooks show without pyplot."""
+    from loopcal.report.figures.notebook_figure import FigureLayout, NotebookFigure
 
-    return NotebookFigure(figsize=(width, height), layout="constrained")
+    return NotebookFigure(figsize=(width, height), layout=FigureLayout())
 
 
 def start_panels(
@@ -103,8 +82,7 @@ def start_panels(
 ) -> tuple[Figure, Any]:
     """Return a figure of this size [inch], and its panels (rows, columns); how : of `subplots`."""
     figure = start_figure(width, height)
-    how |= {} if _IS_PAGE.get() else {"squeeze": False}
-    return figure, figure.subplots(rows, columns, **how)
+    return figure, figure.subplots(rows, columns, squeeze=False, **how)
 
 
 def label_axes(axes: Axes, x: str, y: str, title: str = "", grid: bool = True) -> None:
@@ -127,8 +105,6 @@ def finish_figure(figure: Figure, title: str) -> Figure:
 
 def make_handle(label: str, **style: Any) -> Any:
     """Return a line or marker for a legend."""
-    if _IS_PAGE.get():
-        return Handle(label, read_style(**style))
     from matplotlib.lines import Line2D
 
     return Line2D([], [], label=label, **style)
@@ -136,8 +112,6 @@ def make_handle(label: str, **style: Any) -> Any:
 
 def make_patch(label: str, color: str) -> Any:
     """Return an area for a legend."""
-    if _IS_PAGE.get():
-        return Handle(label, read_style(color=color), is_area=True)
     from matplotlib.patches import Patch
 
     return Patch(color=color, label=label)
@@ -203,9 +177,6 @@ def scale_logarithmically(axis: Any, numbers: Sequence[float] = TICKS, decades: 
     """Make an axis of matplotlib logarithmic, with plain numbers: these times powers of ten. On a
     long axis, and without `numbers`, there are at most so many `decades`, where these are given.
     """
-    if isinstance(axis, PageAxis):
-        axis.scale_logarithmically(numbers, decades)
-        return
     from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
     axis.axes.set(**{f"{axis.axis_name}scale": "log"})
@@ -223,9 +194,6 @@ def scale_logarithmically(axis: Any, numbers: Sequence[float] = TICKS, decades: 
 
 def label_sparsely(axis: Any, most: int = 10, is_whole: bool = True, **how: Any) -> None:
     """Write at most so many numbers, or whole numbers, at an axis of matplotlib."""
-    if isinstance(axis, PageAxis):
-        axis.label_sparsely(most, is_whole)
-        return
     from matplotlib.ticker import MaxNLocator
 
     axis.set_major_locator(MaxNLocator(most, integer=is_whole, **how))
@@ -237,8 +205,6 @@ def show_names(figure: Figure) -> Figure:
     matplotlib reads what stands between two `$` as mathematics: `$\frac{` in the name of a robot
     would make it fail.
     """
-    if isinstance(figure, PageFigure):
-        return figure
     from matplotlib.text import Text
 
     for text in figure.findobj(Text):

@@ -26,7 +26,6 @@ from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.solutions import Solution, forward
 from loopcal.numerics.statistics import choose_evenly
 from loopcal.plain_text import escape
-from loopcal.report.figures.page_figure import Colors, name_color
 from loopcal.report.figures.style import COLORS, ERROR, FRAME_COLORS, POSE, SEQUENTIAL
 from loopcal.results.tables import choose_unit, format_number
 from loopcal.typing import FloatArray, IntArray
@@ -470,6 +469,9 @@ def _describe_map(scene: Scene, unit: Unit) -> dict[str, Any] | None:
     """Return the reached poses of the accuracy map with their colors, the triangles of the solid
     around them, and the place of the largest uncertainty.
     """
+    from matplotlib import colormaps
+    from matplotlib.colors import Normalize, to_hex
+
     if scene.accuracy is None:
         return None
     points, values = scene.map_points, scene.accuracy.uncertainty.position
@@ -477,9 +479,9 @@ def _describe_map(scene: Scene, unit: Unit) -> dict[str, Any] | None:
     known = np.isfinite(values)
     if not (reached & known).any():
         return None
-    scale = Colors(SEQUENTIAL, values[known].min(), values[known].max())
+    scale = Normalize(values[known].min(), values[known].max())
     shades = [
-        name_color(scale.pick(value)) if np.isfinite(value) else UNBOUNDED
+        to_hex(colormaps[SEQUENTIAL](scale(value))) if np.isfinite(value) else UNBOUNDED
         for value in values[reached]
     ]
     shown, largest = (
@@ -523,6 +525,9 @@ def _list_legend(scene: Scene, parts: tuple[Part, ...]) -> list[dict[str, str]]:
 
 def _describe_scale(scene: Scene) -> tuple[tuple[str, str, bool], ...]:
     """Return the legend of the accuracy map."""
+    from matplotlib import colormaps
+    from matplotlib.colors import to_hex
+
     if scene.accuracy is None:
         return ()
     values = scene.accuracy.uncertainty.position
@@ -530,8 +535,7 @@ def _describe_scale(scene: Scene) -> tuple[tuple[str, str, bool], ...]:
     known = values[np.isfinite(values)] / unit.factor_to_si
     if not len(known):
         return ()
-    scale = Colors(SEQUENTIAL, 0.0, 1.0)
-    stops = [name_color(scale.pick(share)) for share in np.linspace(0.0, 1.0, 5)]
+    stops = [to_hex(colormaps[SEQUENTIAL](share)) for share in np.linspace(0.0, 1.0, 5)]
     ends = " to ".join(f"{value:.3g}" for value in (known.min(), known.max()))
     text = f"position uncertainty (rms) over the workspace, {ends} {unit.symbol}"
     unbounded = bool(len(known) < len(values))
