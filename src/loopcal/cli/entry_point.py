@@ -47,6 +47,7 @@ SECTIONS = {
         "plan": ("plan", "Plan which poses to measure, and write a sheet for them."),
         "gcode": ("exchange", "Write a program that moves a machine to the poses of a plan."),
         "fill": ("exchange", "Fill in the sheet of a plan from the export of an instrument."),
+        "board": ("picture", "Draw a board to print, for pictures by a phone or camera."),
         "simulate": ("measurement", "Write a measurement file of a simulated machine."),
     },
     "Calibrate": {

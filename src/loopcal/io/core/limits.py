@@ -272,6 +272,7 @@ REPLICATES = CountLimit(
     10**9, "trials of a cell", "`replicates` of study files and of `loopcal study extend`"
 )
 WORKERS = CountLimit(4_096, "workers", "`workers` of `loopcal study run` and `extend`")
+SQUARES = CountLimit(100, "squares", "`columns` and `rows` of `loopcal board`, each")
 
 COUNT_LIMITS = tuple(value for value in vars().values() if isinstance(value, CountLimit))
 """The limits of counts, in the order of docs/files.md."""
