@@ -24,6 +24,7 @@ from benchmarks.peers.__main__ import compile_ceres, read_words
 from loopcal.estimate.identification import identify
 from loopcal.estimate.penalties import MAP
 from loopcal.io.robot.robot_file import load_robot
+from loopcal.measure.kinds.position import Position
 from loopcal.measure.kinds.setup_parameters import encode_rotation
 
 SOURCE = Path(__file__).with_name("sessions_ceres.cpp")
@@ -43,10 +44,12 @@ def main() -> int:
         if compiled is None:
             print("Ceres needs g++ and the headers of ceres, glog and eigen (libceres-dev)")
             return 1
+        printed: dict[str, list[str]] = {}
         for poses, sessions in CASES:
             data = draw_sessions(robot, poses, sessions, 3)
             (rows,), file = data.observations, Path(name) / "numbers.txt"
             kind, entries = rows.kind, robot.parameters.entries
+            assert isinstance(kind, Position)
             number = np.unique(rows.session, return_inverse=True)[1]
             station = encode_rotation(np.eye(3), kind.T_base_frame[:3, :3])
             start = np.r_[station, kind.T_base_frame[:3, 3], kind.places.ravel()]
@@ -59,7 +62,7 @@ def main() -> int:
             head = f"{poses} 3 {sessions} {float(np.sqrt(rows.covariance[0, 0, 0]))!r}"
             text = (" ".join(map(repr, part.ravel().tolist())) for part in parts)
             file.write_text("\n".join([head, *text]) + "\n", encoding="ascii")
-            ours, theirs, fit, printed = [], [], identify(robot, data, MAP()), {}
+            ours, theirs, fit = [], [], identify(robot, data, MAP())
             for _ in range(rounds):
                 begin = time.process_time()
                 fit = identify(robot, data, MAP())

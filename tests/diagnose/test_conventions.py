@@ -42,7 +42,7 @@ from loopcal.parameters import ParameterTable
 from loopcal.units import Dimension
 from tests.zoo import load_cached_robot
 
-SIGMA = {Dimension.LENGTH: 1e-5, Dimension.ANGLE: 5e-5}  # [m], [rad]
+SIGMA = {Dimension.LENGTH: 1e-5, Dimension.ANGLE: 5e-5, Dimension.PIXEL: 0.1}  # [m], [rad], [px]
 FULL = Pose()
 PAIR = np.array([[0.1, 0.0, 0.02], [-0.05, 0.08, 0.02]])
 

@@ -30,6 +30,7 @@ NEAREST = 1e-3
 """Share of the distance from the camera below which the depth of a point is not taken, so that a
 point beside or behind the camera has a large, finite residual that leads back."""
 FEWEST = 4  # points of a picture that determine the pose of a board
+LEVEL = 1e-5  # tilt of boards, as a share of squared slopes, below which they count as level
 STEPS, HALVINGS, CHANGE = 40, 6, 1e-8  # of the descent; a relative change that ends it
 FEW_STEPS = 10  # of the descent to the pose of a board from a closed form
 ROUNDING = 1e-12  # relative increase of a sum of squares that is none
@@ -145,9 +146,11 @@ def solve_focal_lengths(
     H /= np.linalg.norm(H, axis=(1, 2), keepdims=True)
     first, second = H[..., 0], H[..., 1]
     both = np.concatenate([first * second, first * first - second * second])
+    scale = np.linalg.norm((first * first + second * second)[:, :2])
     for columns in (both[:, :2], both[:, :2].sum(axis=1, keepdims=True)):  # else fx = fy
         weights, _, rank, s = np.linalg.lstsq(columns, -both[:, 2], rcond=None)
-        if rank == columns.shape[1] and s[-1] > 1e-4 * s[0] and (weights > 0.0).all():
+        is_determined = rank == columns.shape[1] and s[-1] > max(1e-4 * s[0], LEVEL * scale)
+        if is_determined and (weights > 0.0).all():
             focal = 1.0 / np.sqrt(weights)
             return np.broadcast_to(focal, 2).copy()
     return None
