@@ -1,14 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """A kinematics component of LinuxCNC (halcompile) with the complete model of an identified robot.
 
-It wraps the C file of `loopcal.io.formats.c_kinematics`. LinuxCNC's axes x, y, z, a, b, c are the
-platform's x, y, z, roll, pitch, yaw, joints are readings; lengths are in the robot file's unit,
-which has to be that of the machine, angles in degrees. Each parameter whose effect is linear is a
-pin. Source: the documentation of halcompile and of kinematics modules (LinuxCNC 2.9).
+`kinematics.comp` beside this file wraps the C file of `loopcal.io.formats.c_kinematics`. LinuxCNC's
+axes x, y, z, a, b, c are the platform's x, y, z, roll, pitch, yaw, joints are readings; lengths are
+in the robot file's unit, which has to be that of the machine, angles in degrees. Each parameter
+whose effect is linear is a pin. Source: the documentation of halcompile and of kinematics modules
+(LinuxCNC 2.9).
 """
 
 from __future__ import annotations
 
+from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
@@ -25,100 +27,6 @@ NAME = "loopcalkins"
 """Name of the component, which its file must have."""
 AXES = {"x": "tran.x", "y": "tran.y", "z": "tran.z", "roll": "a", "pitch": "b", "yaw": "c"}
 """Coordinate -> member of LinuxCNC's pose."""
-
-TEMPLATE = '''component {name} "Kinematics of {robot}, identified by loopcal";
-description """
-Install it:
-.nf
-    sudo halcompile --install {name}.comp
-.fi
-In the INI file, with lengths in {unit}:
-.nf
-{ini}
-.fi
-In a HAL file, to change a parameter without compiling:
-.nf
-    setp {name}.{example} ...
-.fi
-""";
-license "Apache-2.0";
-option singleton yes;
-{pins}
-;;
-#define KINEMATICS_WORK static /* real-time threads have small stacks */
-{code}
-#include "kinematics.h"
-
-static const double JOINT_UNIT[KINEMATICS_READINGS] = {joint_units};
-static const double AXIS_UNIT[KINEMATICS_COORDINATES] = {axis_units};
-static kinematics_state state;
-static int is_begun;
-
-/* Take the pins; parameters are computed again only where one of them changed. */
-static void update(void)
-{{
-#if KINEMATICS_PARAMETERS > 0
-    struct __comp_state *__comp_inst = __comp_first_inst; /* whose pins these are */
-    static double known[KINEMATICS_PARAMETERS];
-    const double now[KINEMATICS_PARAMETERS] = {{
-{values}
-    }};
-    int i, is_new = !is_begun;
-    for (i = 0; i < KINEMATICS_PARAMETERS; i++) {{
-        is_new |= known[i] != now[i];
-        known[i] = now[i];
-    }}
-    if (is_new)
-        kinematics_set_parameters(now);
-#endif
-    if (!is_begun)
-        kinematics_home(&state);
-    is_begun = 1;
-}}
-
-KINEMATICS_TYPE kinematicsType(void)
-{{
-    return KINEMATICS_BOTH;
-}}
-
-int kinematicsForward(const double *joint, struct EmcPose *world,
-                      const KINEMATICS_FORWARD_FLAGS *fflags, KINEMATICS_INVERSE_FLAGS *iflags)
-{{
-    double readings[KINEMATICS_READINGS], pose[12], c[KINEMATICS_COORDINATES];
-    int i;
-    (void)fflags;
-    (void)iflags;
-    update();
-    for (i = 0; i < KINEMATICS_READINGS; i++)
-        readings[i] = joint[i] * JOINT_UNIT[i];
-    if (kinematics_forward(readings, &state, pose) != KINEMATICS_OK)
-        return -1;
-    kinematics_coordinates(pose, c);
-{to_world}
-    return 0;
-}}
-
-int kinematicsInverse(const struct EmcPose *world, double *joint,
-                      const KINEMATICS_INVERSE_FLAGS *iflags, KINEMATICS_FORWARD_FLAGS *fflags)
-{{
-    double readings[KINEMATICS_READINGS], c[KINEMATICS_COORDINATES];
-    int i;
-    (void)fflags;
-    (void)iflags;
-    update();
-{from_world}
-    if (kinematics_inverse(c, &state, readings) != KINEMATICS_OK)
-        return -1;
-    for (i = 0; i < KINEMATICS_READINGS; i++)
-        joint[i] = readings[i] / JOINT_UNIT[i];
-    return 0;
-}}
-
-KINS_NOT_SWITCHABLE
-EXPORT_SYMBOL(kinematicsType);
-EXPORT_SYMBOL(kinematicsForward);
-EXPORT_SYMBOL(kinematicsInverse);
-'''
 
 
 def write(source: ExportSource, into: Path | None) -> Exported:
@@ -156,7 +64,8 @@ def write(source: ExportSource, into: Path | None) -> Exported:
         f"    c[{i}] = world->{AXES[name]} * AXIS_UNIT[{i}];"
         for i, name in enumerate(robot.controlled)
     ]
-    text = TEMPLATE.format(
+    template = files("loopcal.io.formats").joinpath("kinematics.comp").read_text("utf-8")
+    text = template.format(
         name=NAME,
         robot=robot.name.replace('"', "'"),
         unit=unit.symbol,
