@@ -58,8 +58,6 @@ def load_record(
 
     facts : file with what people state beside the results.
 
-    Raises
-    ------
     FileError : a file of the run folder is not the one that the calibration wrote.
     """
     if isinstance(source, Run):
@@ -154,8 +152,6 @@ def save_report(
 def name_data(path: Path) -> Path:
     """Return the JSON file beside the HTML file of a report.
 
-    Raises
-    ------
     FileError : the name does not end in .html.
     """
     check_ending(path, "report")
@@ -261,8 +257,6 @@ def check_browser(output: Path) -> str:
 def print_pdf(page: Path, output: Path) -> None:
     """Print an HTML file to a PDF file, on A4 as its style sheet says.
 
-    Raises
-    ------
     FileError : no browser is installed, it fails, or the file cannot be written.
     """
     browser = check_browser(output)

@@ -82,8 +82,6 @@ def import_optional(
 ) -> Any:
     """Return a module of an optional package, which the extra of this name installs.
 
-    Raises
-    ------
     MissingPackageError or `error` : it is not installed.
     """
     try:

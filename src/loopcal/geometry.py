@@ -486,8 +486,6 @@ def _repeat_identity(values: FloatArray) -> FloatArray:
 class OrientationForm:
     """A form in which a rotation is written; the name decides all else.
 
-    Attributes
-    ----------
     name : its name in files, e.g. "euler-xyz".
     columns : names of its c columns. noise_columns : names of the three noises.
     dimension : of the columns.

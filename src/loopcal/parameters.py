@@ -23,8 +23,6 @@ Scalar = TypeVar("Scalar", bound=np.generic)
 class Parameter:
     """One parameter.
 
-    Attributes
-    ----------
     name : e.g. `leg3.base.x`.
     dimension : length [m], angle [rad] or ratio [1].
     nominal : value by design [SI].
@@ -50,8 +48,6 @@ class CommonError:
 
     Each of them deviates by its own error, of its own tolerance, plus the same common error.
 
-    Attributes
-    ----------
     name : e.g. `batch of rods`. parameters : names of those that share it, of one dimension.
     tolerance : standard deviation of the common error [SI].
     """
@@ -65,8 +61,6 @@ class CommonError:
 class ParameterTable:
     """Parameters in a fixed order; arrays over it are (p,) and read-only.
 
-    Attributes
-    ----------
     entries : the parameters. common : errors that several of them share.
     """
 

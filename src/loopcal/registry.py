@@ -33,8 +33,6 @@ class UnknownNameError(DataError, KeyError):
 class Registry(Mapping[str, T]):
     """Entries by name; an unknown name is an `UnknownNameError`.
 
-    Parameters
-    ----------
     noun : what an entry is, for messages. group : of entry points of other packages, which are
         read only if loopcal itself does not have a name, or if all names are listed; empty for
         entries of loopcal alone.
@@ -76,8 +74,6 @@ class Registry(Mapping[str, T]):
     def resolve(self, name: str) -> str:
         """Return the listed name of an entry for a name or alias.
 
-        Raises
-        ------
         UnknownNameError : there is none.
         """
         name = self.aliases.get(name, name)

@@ -48,8 +48,6 @@ def report_no_progress(_done: int, _total: int, _what: str, /) -> None:
 class StepCounter:
     """Reports the steps of one task to a progress callback, one after the other.
 
-    Parameters
-    ----------
     progress : the callback. total : number of steps.
     """
 

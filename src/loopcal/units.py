@@ -174,8 +174,6 @@ ARTICLES = {
 def find_unit(symbol: str, dimension: Dimension | None = None) -> Unit:
     """Return the unit with this symbol.
 
-    Raises
-    ------
     UnitError
         Unknown symbol, or a unit of another than the given dimension; lists the allowed ones.
     """
@@ -208,8 +206,6 @@ def parse_number(text: str) -> float | None:
 def parse_quantity(text: str, dimension: Dimension | None = None) -> float:
     """Return the SI value of a number with its unit, such as `0.02mm` or `5 urad`.
 
-    Raises
-    ------
     UnitError : not a finite number, unit missing, unknown, or of another dimension.
     """
     stripped, example = text.strip(), EXAMPLES[dimension or Dimension.LENGTH]
@@ -232,8 +228,6 @@ def parse_quantity(text: str, dimension: Dimension | None = None) -> float:
 def to_si(value: float, unit: Unit) -> float:
     """Return a finite number in SI.
 
-    Raises
-    ------
     UnitError : the number is larger than LARGEST.
     """
     if not abs(value) <= LARGEST / unit.factor_to_si:

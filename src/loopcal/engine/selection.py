@@ -97,8 +97,6 @@ def select_engine(choice: str = "") -> Engine:
 
     An entry point is a function that returns an engine for a variant; `""` is its own choice.
 
-    Raises
-    ------
     MissingPackageError : there is no such engine, or it does not work here.
     """
     choice = choice.strip() or (NATIVE if _is_native_installed() else NUMPY)

@@ -32,8 +32,6 @@ from loopcal.typing import BoolArray, FloatArray, IntArray, Progress, report_no_
 class FilteredStep(TrialBatch):
     """A step of some trials towards the filtered solution.
 
-    Attributes
-    ----------
     deviation : (a, p) total deviation to which it leads. target : (a, p) that of the full step.
     length, full_length : (a,) of this step and of the full one, in tolerances.
     predicted : (a,) decrease of sum of squares plus penalty by the linear model.
@@ -101,8 +99,6 @@ class SpectralModel(TrialBatch):
 class TriangularModel(TrialBatch):
     """The triangular factor of the rows, for a penalty that does not depend on them.
 
-    Attributes
-    ----------
     factor : (t, p + 1, p + 1) of rows [A | r]. deviation : (t, p) where they were linearized.
     equations : (t,) that were folded.
     step : (t, p) the full step. gain : (t,) decrease by it of the sum of squares with penalties, as
@@ -290,8 +286,6 @@ class StepControl:
 class Descent:
     """Where the descent ended.
 
-    Attributes
-    ----------
     deviation : (t, p) total deviation z from nominal, in tolerances.
     linear_model : of the rows next to `deviation`.
     cost : (t,) sum of squares of the whitened residuals.
@@ -362,8 +356,6 @@ def descend(
 
     A trial that fails is marked in `status` and never stops the others.
 
-    Parameters
-    ----------
     deviation : (t, p) where to begin, in tolerances. tolerance : relative rank tolerance.
     start : warm start; default: the first one of the problem.
     progress : receives each step with the sum of squares of the first trial.
@@ -603,8 +595,6 @@ class _Run:
 class _Damping:
     """Levenberg-Marquardt damping of t trials by Nielsen's rule: working memory of one iteration.
 
-    Parameters
-    ----------
     first : damping of the first step, in units of these squares.
     model : at the start; its largest squared singular values scale the damping.
     """

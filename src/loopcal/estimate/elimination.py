@@ -37,8 +37,6 @@ from loopcal.typing import BoolArray, FloatArray, IntArray
 class NodeMembers(NamedTuple):
     """Rows of one kind that belong to nodes of one structure.
 
-    Attributes
-    ----------
     structure : of the nodes, -1 for rows that use no free nuisance parameter.
     rows : (k,) numbers of the rows. nodes : (k,) their nodes.
     columns : (k, u) columns of their nuisance parameters in the node's path; fixed ones have the
@@ -54,8 +52,6 @@ class NodeMembers(NamedTuple):
 class NodeRows(NamedTuple):
     """Whitened rows of nodes of one structure.
 
-    Attributes
-    ----------
     structure : -1 for rows of the machine alone. nodes : (k,). numbers : (k,) what each of the k
         sets of rows belongs to: the row of a kind, or the component of poses.
     rows : (a, k, m, w + p + 1). kind : number of the kind; -1 where they are of several.
@@ -72,8 +68,6 @@ class NodeRows(NamedTuple):
 class EliminatedNuisance(TrialBatch):
     """Nuisance parameters of t trials at the point of a linearization.
 
-    Attributes
-    ----------
     values : (t, U) at which the rows are linearized.
     elimination : step to the best values, their change with the machine, and their variances.
     """
@@ -91,8 +85,6 @@ class EliminatedNuisance(TrialBatch):
 class NuisanceElimination:
     """The U nuisance parameters of a problem and their elimination tree.
 
-    Attributes
-    ----------
     local : their table, and which rows use them. tree : in which order they are eliminated.
     is_free : (U,). has_prior : (U,) free with a tolerance.
     prior_mean : (T | 1, U) [SI] means of the priors of T trials.

@@ -79,8 +79,6 @@ ASSUMED = "assumed"
 class FitAnalysis:
     """What the end of a fit shows.
 
-    Attributes
-    ----------
     robot : as it was given. free : its free parameters. options : with the method that was used.
     data, problem : the measurements and their rows. weights : (n,) of the poses by a loss.
     weighted : the problem with these weights. fit : where the descent ended.

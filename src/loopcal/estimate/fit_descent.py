@@ -372,8 +372,6 @@ Run = Callable[[Problem, FloatArray, Start | None], Descent]
 class RobustFit:
     """A robust descent.
 
-    Attributes
-    ----------
     fit : descent of the weighted problem, after all those that determined the weights. The first of
         its costs, and those of the last descent, have these weights; those between have the weights
         of their rounds.

@@ -48,8 +48,6 @@ MOST_KEPT = 50_000_000  # derivatives of poses that are kept for the rows of a f
 class FitLinearization(NamedTuple):
     """The problem of a fit at its estimate, weighted as in the fit (t = 1).
 
-    Attributes
-    ----------
     fit : it. data : its measurements, with the sigma of their readings, without excluded poses.
     problem : without the rows of an earlier calibration. linearization : with them.
     solution : poses and nuisance parameters at which both are linearized.
@@ -110,8 +108,6 @@ def linearize_fit(
     linear : the result for the same fit before findings widened its covariance, which is used
         again; anew where another test of the residuals scales the noise since.
 
-    Raises
-    ------
     DataError : the measurements have another number of poses than the fit.
     """
     if linear is not None and fit.residual_test is linear.fit.residual_test:
@@ -186,8 +182,6 @@ SLOPE, ROOT = "local_slope", "local_root"
 class FitUncertainty(NamedTuple):
     """Free parameters and nuisance parameters of a fit with their joint uncertainty.
 
-    Attributes
-    ----------
     posterior : of the machine. names : (U,) nuisance parameters.
     slope : (U, p) S [SI / SI]. root : (U, w) T [SI], see `NuisanceEstimate`.
     noise_scale : factor on the stated sigmas of the rows. noise : what the fit says of other rows.
@@ -273,8 +267,6 @@ def find_share(parts: RowSources, source: int, rows: IntArray | slice = slice(No
 class SourceFactor(NamedTuple):
     """A triangular factor of rows of one source that move the setup parameters of one cluster.
 
-    Attributes
-    ----------
     source : its number. unknowns : (u,) the setup parameters. setup : (m, u) rows by these, in
         units of their standard deviations. machine : (m, p) by the machine.
     """

@@ -31,8 +31,6 @@ angles, this value for ratios.
 class FreeParameters:
     """The free parameters as estimation uses them: value = nominal + tolerance * z.
 
-    Attributes
-    ----------
     robot : Mechanism; fixed parameters keep its values.
     places : (p,) positions of the free parameters in the robot's table.
     nominal, tolerance : (p,) [SI].
@@ -133,8 +131,6 @@ class FreeParameters:
 def select_free_parameters(robot: Mechanism) -> FreeParameters:
     """Return the free parameters of a robot with their tolerances, stated or default.
 
-    Raises
-    ------
     MechanismError
         The robot is over-constrained, and its loops do not close with other values of some.
     """

@@ -317,8 +317,6 @@ deviation."""
 class SharedFactor:
     """The factor of the rows of one trial at the start of all.
 
-    Attributes
-    ----------
     solution : of this trial at the start. start : there, for the linearizations nearby.
     triangle : (p, p) R. by_residuals : (p, m) R^-1 Q' of the rows. by_deviation : (p, p) R^-1 Q' P.
     """
@@ -540,8 +538,6 @@ def _cut_problem(problem: Problem, trials: IntArray) -> Problem:
 def compute_trial_posterior(fits: IdentifiedTrials, trials: Trials, trial: int) -> Posterior:
     """Return the posterior of a trial, as its own `identify` gives it for stated noise.
 
-    Parameters
-    ----------
     fits : of `identify_trials`. trials : their measurements. trial : number of the machine.
     """
     free, chosen = fits.free_parameters, np.array([trial])

@@ -35,8 +35,6 @@ from loopcal.typing import BoolArray, FloatArray
 class ObservedPoses:
     """Poses of a robot, solved and linearized once, that any kind may observe.
 
-    Attributes
-    ----------
     free : the free parameters. readings : (n, actuators) [SI]. linearized : (1, n) poses.
     """
 

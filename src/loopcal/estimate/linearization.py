@@ -47,8 +47,6 @@ if TYPE_CHECKING:
 class Start(TrialBatch):
     """Warm start of t trials.
 
-    Attributes
-    ----------
     deviation : (t, p) where it was made.
     nuisance : (t, U) values of the nuisance parameters [SI]. slope : (t, U, p) their change.
     first_nuisance : (t, U) values with which the first linearization began.
@@ -89,8 +87,6 @@ class Start(TrialBatch):
 class Linearization(TrialBatch):
     """A problem of t trials at deviations z, nuisance parameters and poses eliminated.
 
-    Attributes
-    ----------
     deviation : (t, p) z.
     factor : (t, p + 1, p + 1) triangular factor of the whitened rows [A | r] that are left.
     cost : (t,) sum of squares; infinite where a needed pose is not reached.
@@ -113,8 +109,6 @@ class Linearization(TrialBatch):
 class LeverageRows(NamedTuple):
     """Whitened rows by everything that they determine, poses eliminated.
 
-    Attributes
-    ----------
     poses : (k,) first pose of each set of rows.
     rows : (k, m, U + p + 1). The first U columns, none without nuisance parameters, are in units of
         the standard deviations of these; the next p are those of the machine as the nuisance
@@ -134,8 +128,6 @@ class LinearizedPoses:
 
     Where a pose is not reached T is the identity and all derivatives are zero.
 
-    Attributes
-    ----------
     T : (a, n, 4, 4) T_base_platform [m]. is_reached : (a, n).
     by_parameters : (a, n, 6, p) twist by the scaled parameters; p = 0 where not asked for.
     joints : name -> (a, n) [SI]. joints_by_parameters : name -> (a, n, p), passive joints and
@@ -272,8 +264,6 @@ def mask_unreached(
 class KindRows(NamedTuple):
     """Whitened rows of one kind.
 
-    Attributes
-    ----------
     machine : (a, r, m, p + 1) by the scaled parameters, and the residual behind them; p = 0 where
         derivatives were not asked for.
     by_nuisance : (a, r, m, u) by the nuisance parameters that each row uses; None without any.
@@ -463,8 +453,6 @@ def spread_states(state: engine.State, trials: int, poses: int) -> engine.State:
 class PoseEstimates(TrialBatch):
     """Poses of t trials that are unknown because readings are uncertain, where all rows fit best.
 
-    Attributes
-    ----------
     states : (t, n) closed poses and true readings. is_reached : (t, n).
     rank : (t, components) coordinates of poses that rows determine.
     is_undetermined : (t, n) poses with a coordinate that no row determines; they stay where the
@@ -483,8 +471,6 @@ class PoseEstimates(TrialBatch):
 class PoseSolution:
     """Poses and nuisance parameters of a trials at given deviations.
 
-    Attributes
-    ----------
     nuisance : (a, U) values that fit best, or as given; None without any.
     linearized : the poses of the only block; None where there are several, which are solved again
         block by block.

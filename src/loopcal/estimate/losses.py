@@ -120,8 +120,6 @@ class Tukey:
 def weigh_blocks(loss: Loss, distance: FloatArray, degrees: FloatArray) -> FloatArray:
     """Return the weights (u,) that a loss gives to blocks; a user may have written it.
 
-    Raises
-    ------
     EstimationError : not one finite weight of at least 0 for each block.
     """
     weight = np.asarray(loss.weight(distance, degrees), dtype=np.float64)

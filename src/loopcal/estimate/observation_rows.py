@@ -24,8 +24,6 @@ is in memory: larger parts leave less time to Python, which runs in one thread a
 class ObservationRows:
     """Rows of one kind for t trials.
 
-    Attributes
-    ----------
     kind : what was measured.
     poses : (r,) pose that each row observed; (r, links) where rows compare several poses.
     measured : (t | 1, r, c) [SI]. whitener : (t | 1, r, m, m), zero rows for absent components.

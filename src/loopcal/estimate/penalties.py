@@ -606,8 +606,6 @@ def adapt_method(
 class Regularization:
     """Ridge parameter or truncation of a fit.
 
-    Attributes
-    ----------
     parameter : "lam", the ridge parameter in squared standard deviations of the noise per squared
         tolerance, or "k", the number of directions of a truncated SVD.
     value : of the parameter; the largest one where each parameter has its own `lam`.

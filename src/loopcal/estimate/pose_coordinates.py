@@ -53,13 +53,9 @@ size. Beyond it closure is not linear."""
 class PoseCoordinates:
     """Coordinates of n poses; these have none, because their readings are exact.
 
-    Parameters
-    ----------
     free : the free parameters. names : joints that kinds look at.
     readings : (1, n, actuators) [SI] exact ones; those of states come first where they have any.
 
-    Attributes
-    ----------
     count : number k of each pose.
     are_shared : whether trials of equal parameters have equal poses.
     rows_of_readings : number of kinds, the last ones, whose rows depend on coordinates alone.
@@ -136,8 +132,6 @@ class PoseCoordinates:
 class MeasuredPoses(PoseCoordinates):
     """Poses that were measured in full, at which closure is linearized and not solved.
 
-    Parameters
-    ----------
     T : (T | 1, n, 4, 4) [m] of every trial.
     """
 
@@ -180,8 +174,6 @@ class MeasuredPoses(PoseCoordinates):
 class ReadingCoordinates(PoseCoordinates):
     """As many actuators as freedoms: u moves the readings, in units of their sigma.
 
-    Parameters
-    ----------
     scale : (n, actuators) [SI]; 0 of exact readings.
     """
 
@@ -230,8 +222,6 @@ class TwistCoordinates(PoseCoordinates):
     """More actuators than freedoms: u moves the platform in its freedoms, turns in units of 1 m
     over the robot's size.
 
-    Raises
-    ------
     EstimationError
         An actuator drives several limbs, so that the pose does not determine its reading.
     """

@@ -42,8 +42,6 @@ others."""
 class EstimatedPoses:
     """Poses where the machine stood, by all that was measured there and the identified machine.
 
-    Attributes
-    ----------
     labels : (n,). poses : (n, 4, 4) T_base_platform [m], NaN where not reached or excluded.
     readings : (n, actuators) [SI], the true ones, NaN where excluded.
     sigma : (n, actuators) [SI] of the recorded ones: 0 exact, infinite not taken or not believed.
@@ -201,8 +199,6 @@ def predict_from_readings(robot: Mechanism, data: Measurements) -> tuple[Solutio
 class PoseFit(NamedTuple):
     """Poses of a robot where readings and rows fit best.
 
-    Attributes
-    ----------
     solution : of n poses. is_determined : (n,) poses that the data determine.
     absorbed : (n,) number of residuals of rows that each pose takes up, which are its unknowns less
         its recorded uncertain readings; poses that rows link are counted at the first of them.
@@ -259,8 +255,6 @@ MM = 1e3
 class UnclosedPoses(NamedTuple):
     """Poses at which the loops do not close with their readings.
 
-    Attributes
-    ----------
     poses : their labels, the widest open first. gaps : (k,) [m] what is left open in the loops.
     total : number of poses with all readings.
     """

@@ -106,8 +106,6 @@ class _Step:
 class PoseRows:
     """The rows at n poses, whose coordinates are eliminated before all other unknowns.
 
-    Attributes
-    ----------
     free : the free parameters. rows : of every kind. nuisance : nuisance parameters, if any.
     coordinates : of the poses. member : (n,) component of each pose; one of all poses where they
         have no coordinates.
@@ -597,8 +595,6 @@ LARGEST = 2000
 class ComponentGroup:
     """Components of equal structure within a block: C of them, of L poses each.
 
-    Attributes
-    ----------
     components : (C,) their numbers. poses : (C, L) their places in the block.
     height : number of rows that are kept for each; rows that are not used are zero.
     structure, nodes : structure and nodes (C,) of the nuisance parameters that their rows use, -1
@@ -619,8 +615,6 @@ class ComponentGroup:
 class PoseBlock:
     """Some poses and the rows that observed them.
 
-    Attributes
-    ----------
     poses : (b,) numbers of the poses.
     row_numbers : of every kind, (k,). rows : of every kind, poses numbered within the block.
     is_needed : (b,) poses that some row needs.

@@ -48,8 +48,6 @@ TOLERANCES = "tolerances"
 class CovariancePart(NamedTuple):
     """A part of the covariance of the parameters whose size was estimated from data.
 
-    Attributes
-    ----------
     source : what causes it: "noise", "tolerances", or the code of the finding with which it was
         added.
     root : (p, k) [SI], the part is root root'.
@@ -85,8 +83,6 @@ def combine_degrees(total: FloatArray, squares: Iterable[tuple[FloatArray, float
 class ShownNoise:
     """The variance of whitened rows that residuals alone show, in units of the stated one.
 
-    Attributes
-    ----------
     variance : that of the residuals that no parameter explains. degrees : its degrees of freedom.
     used : the variance that the covariance of the fit contains.
     """
@@ -117,8 +113,6 @@ class DataInformation:
     """What the data of a fit say of its parameters, without any tolerance or penalty: rows
     B (e - nominal) = deviations + noise. What lies outside their range says nothing of e.
 
-    Attributes
-    ----------
     rows : (r, p) B [1 / SI]. deviations : (r,) right-hand sides [1].
     variance : of the noise of a row, in units of the stated one: what the residuals show, or else
         what the fit uses; NaN without intervals. degrees : its degrees of freedom.
@@ -168,8 +162,6 @@ DISCREPANCY = "residuals.model-discrepancy"
 class ModelDiscrepancy:
     """Slow errors of the poses of a calibrated machine that no geometry explains.
 
-    Attributes
-    ----------
     errors : phi. root : (p, m) L [SI].
     degrees : (d,) degrees of freedom of the amplitude of each direction.
     directions, variance : (p, p), (p,) of the posterior without the discrepancy.
@@ -256,8 +248,6 @@ class InstrumentFrame(NamedTuple):
     `by_parameters` times the error of the parameters, plus `own` times independent errors of unit
     variance, which the noise causes at a known machine.
 
-    Attributes
-    ----------
     T : (4, 4) T_base_frame [m]. by_parameters : (6, p) [per SI]. own : (6, 6); both are zero for a
         frame that is stated.
     by_motions : (6, 12) by motions of the frames of base and platform, as of `frame_twists`; None
@@ -274,8 +264,6 @@ class InstrumentFrame(NamedTuple):
 class FrameKnowledge:
     """How the measurements of a fit determine the frames of the base and the platform.
 
-    Attributes
-    ----------
     unfixed : (12, k) orthonormal motions of both frames that change no measured value, see
         `loopcal.estimate.unfixed_motions`; k = 0 where the measurements determine both frames.
     readings : (m, a) of measured poses, at most some hundred [m, rad].
@@ -344,8 +332,6 @@ def frames_from_arrays(arrays: Mapping[str, np.ndarray]) -> FrameKnowledge | Non
 class Posterior:
     """Free parameters of a robot with their uncertainty.
 
-    Attributes
-    ----------
     robot : Mechanism at the estimate. places : (p,) positions of the free parameters in its table.
     unit : (p,) [SI]. directions : (p, p) V.
     variance : (p,) of each direction; infinite for unknown ones, NaN without intervals.
@@ -470,8 +456,6 @@ class Posterior:
 class VarianceSources(NamedTuple):
     """What the variances of a fit are made of, beside its decomposition and penalty.
 
-    Attributes
-    ----------
     noise : variance of the whitened rows; NaN without intervals.
     prior : (1, p) variance of the true coordinates about nominal, from which the bias of the
         penalty is expected; None for 1 / penalty.

@@ -201,8 +201,6 @@ def refuse_reused_rows(earlier: Prior | Posterior | None, data: Measurements) ->
 def limb_parameters(robot: Mechanism, limb: str) -> tuple[str, ...]:
     """Return the free parameters of a limb: those whose names begin with its name and a point.
 
-    Raises
-    ------
     EstimationError : the limb has no free parameter; the text names the limbs that have.
     """
     free = [p.name for p in robot.parameters.entries if p.free]

@@ -86,8 +86,6 @@ VARIANCES = np.expm1(2.0 * np.linspace(0.0, np.log(WIDEST), 41)[1:])
 class PredictedData(NamedTuple):
     """Data as a prior predicts them, in the parameters.
 
-    Attributes
-    ----------
     information : (t, p, p) Q = A'K^-1 A. score : (t, p) h = A'K^-1 b.
     """
 
@@ -180,8 +178,6 @@ def estimate_log_spread(size: FloatArray, square: FloatArray, center: float) -> 
 class ComponentSearch(NamedTuple):
     """The search for the components of one prior (t = 1).
 
-    Attributes
-    ----------
     rows : decomposition of the rows, their noise 1. correlation : (p, p) as stated, or None.
     unpenalized : (p,) parameters without a prior, or None. candidates : that may be chosen.
     """
@@ -510,8 +506,6 @@ TESTABLE = 1e-6
 class LargestDeviation:
     """The test of the largest of several standard normal statistics.
 
-    Attributes
-    ----------
     statistic : the largest absolute value; 0 without a test. count : number of statistics.
     p_value : probability of a larger one in any of them. names : of the parameters in question.
     """
@@ -526,8 +520,6 @@ class LargestDeviation:
 class PriorConflict:
     """The stated tolerances against the data.
 
-    Attributes
-    ----------
     statistic, degrees, p_value : Q, its degrees of freedom and the probability of a larger Q.
     direction, parameter : the tests of the worst direction and of the worst parameter.
     joint_p_value : probability that the most significant of the three tests is more significant.

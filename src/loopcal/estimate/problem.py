@@ -132,8 +132,6 @@ def _without_noise(rows: ObservationRows) -> ObservationRows:
 class ConsistentPoses(NamedTuple):
     """Finds poses, near given ones, at which rows have no residual.
 
-    Attributes
-    ----------
     poses : rows to satisfy, and readings so uncertain that they follow.
     readings : (T | 1, n, actuators) [SI] where exact readings begin.
     """
@@ -189,8 +187,6 @@ def remove_null_space(
 class Problem:
     """Whitened rows of t machines that share readings and kinds.
 
-    Attributes
-    ----------
     poses : the rows of every kind at the poses; uncertain readings are the last kind.
     readings : (T | 1, n, actuators) [SI] recorded ones, NaN where not taken.
     trials : (t,) numbers of the problem's trials among the T trials of the arrays.

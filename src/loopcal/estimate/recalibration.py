@@ -58,8 +58,6 @@ calibration in a form that `loopcal.measure.fitted_rows.FittedRows` does not rec
 class Change(Result):
     """Whether parameters have changed between two calibrations.
 
-    Attributes
-    ----------
     subject : a limb, or "the machine". names : the parameters in question.
     change : (k,) change of these parameters if no other has changed [SI]; NaN where the data of
         both calibrations do not determine it.
@@ -454,8 +452,6 @@ def explain_change(changes: ParameterChanges, level: float) -> ChangeCause:
 class JudgedChange(NamedTuple):
     """Whether a machine has changed, and what explains it.
 
-    Attributes
-    ----------
     code, data : of its finding, without its family.
     p_value : see `ParameterChanges.compute_probability`. moved : whether it has changed.
     cause : of the change. shift, sd : (k,) change of its parameters [SI].

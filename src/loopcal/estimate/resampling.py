@@ -32,8 +32,6 @@ LEAST_DEGREES = 0.5
 class Resamples(TrialBatch):
     """What t resamples change in the rows of a fit.
 
-    Attributes
-    ----------
     weight : (t, n) factors on the squares of each pose; None where the rows keep theirs.
     offset : of every kind (t, r, m), added to the whitened residuals; None without any.
     center : (t, p) drawn center of the prior, in tolerances from nominal.
@@ -57,8 +55,6 @@ class Resamples(TrialBatch):
 class ResampleFits(TrialBatch):
     """Estimates of t resamples.
 
-    Attributes
-    ----------
     deviation : (t, p) in tolerances from nominal. linear : (t, p) the same to first order about the
         estimate of the fit.
     status : (t,) DescentStatus.

@@ -71,8 +71,6 @@ ASSUMED_UNCERTAINTY = 0.5
 class ResidualTest:
     """The residuals of a fit against the noise.
 
-    Attributes
-    ----------
     chi_square : whitened sum of squares of the rows outside the range of the parameters; like the
         other numbers NaN where the iteration did not converge, because it then belongs to no fit.
         Where a loss chose the weights: of all weighted residuals.

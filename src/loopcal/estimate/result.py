@@ -66,8 +66,6 @@ if TYPE_CHECKING:
 class KindResiduals:
     """Residuals (predicted - measured) of the rows of one kind after the fit.
 
-    Attributes
-    ----------
     kind : its name. components : names of the m residuals. poses : (r,) labels.
     raw : (r, m) [SI]. whitened : (r, m), divided by sigma (zero where absent).
     context : name -> (r,), time [s] and temperatures [degC] of the rows, to plot the residuals
@@ -279,8 +277,6 @@ LAST_DIGITS = 3
 class Spectrum:
     """Singular values of the whitened, tolerance-scaled matrix of a fit.
 
-    Attributes
-    ----------
     rank : number of singular values above `tolerance` times the largest.
     condition : the largest over the smallest that counts. singular_values : (p,), descending.
     """
@@ -295,8 +291,6 @@ class Spectrum:
 class History:
     """The iteration of a fit.
 
-    Attributes
-    ----------
     status : how it ended. iterations : steps taken.
     cost : (i + 1,) whitened sum of squares. With a loss, the first and those after the last change
         of weights use the final weights; those between use the weights of their time. A fit of very
@@ -745,8 +739,6 @@ UNDETERMINED = 1.0
 class NuisanceEstimate(TableResult):
     """Nuisance parameters after a fit. Arrays are (U,) in the order of `table`, SI.
 
-    Attributes
-    ----------
     table : nominal values, priors, and which were kept fixed.
     start : values that fit best at the geometry from which the fit starts; NaN where its poses do
         not determine them.

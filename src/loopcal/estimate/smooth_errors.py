@@ -52,8 +52,6 @@ JITTER = 1e-9
 class SmoothErrors:
     """Slow errors of the tool with the amplitudes of their components.
 
-    Attributes
-    ----------
     tool : (3,) [m] tool point in the platform frame. rotation : (3, 3) to which rotations refer.
     origin, length : (6,) of rotation vectors [rad] and places [m]; an infinite length leaves a
         coordinate out.

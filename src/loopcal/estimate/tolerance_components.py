@@ -148,8 +148,6 @@ WITHOUT_DIGITS = str.maketrans("", "", string.digits)
 class ToleranceComponent:
     """A part of the tolerances that is wider than stated.
 
-    Attributes
-    ----------
     kind : "shift", "group" or "single". name : of the limb, type or parameter.
     places : positions of its free parameters. variance : that it adds, in squared tolerances.
     """

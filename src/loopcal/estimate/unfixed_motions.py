@@ -75,8 +75,6 @@ class UnfixedMotions(NamedTuple):
 class FrameRows:
     """The rows of one machine by motions of frames, collected block by block.
 
-    Parameters
-    ----------
     problem : of one machine. nuisance : (1, U) values of the setup parameters; None without any.
     """
 

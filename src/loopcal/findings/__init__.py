@@ -84,13 +84,9 @@ class Finding:
 def report_finding(code: str, severity: Severity | None = None, **data: Any) -> Finding:
     """Return a finding of the catalog.
 
-    Parameters
-    ----------
     code : of the entry. severity : in place of that of the entry.
     data : what the sentence needs, ready for JSON: numbers, strings, tuples of these, quantities.
 
-    Raises
-    ------
     KeyError : the code is not in the catalog, or `data` lacks one of its fields.
     """
     from loopcal.findings.catalog import find_entry

@@ -43,15 +43,11 @@ LINE = 0.2  # width of a mark [mm]
 class Board:
     """A ChArUco board.
 
-    Parameters
-    ----------
     squares : columns and rows of squares. square, marker : their sides.
     dictionary : of OpenCV, such as 5X5_50.
     measured : the lengths along x and y between the marks of the print, as measured.
     measured_sd : standard deviation of these.
 
-    Raises
-    ------
     DataError : there are too few or too many squares, or a length that cannot be.
     """
 
@@ -149,8 +145,6 @@ Words = tuple[float, float, str]  # left end of the base line, text
 def draw_board(board: Board, paper: tuple[float, float]) -> tuple[list[Shape], list[Words]]:
     """Return the rectangles and texts of a sheet (width, height) [m].
 
-    Raises
-    ------
     DataError : the board does not fit on the sheet. MissingPackageError : OpenCV, which has the
         markers, is not installed.
     """

@@ -222,8 +222,6 @@ def list_tilt_rings(robot: Mechanism, n: int) -> FloatArray:
     """Return coordinates (n, c) [m, rad] on three rings of equal tilt at even azimuths. If z is
     controlled, it takes the ends and the middle of its range in turn, begun anew on each ring.
 
-    Raises
-    ------
     MechanismError : n is no multiple of 3, the robot controls other coordinates than phi, theta and
         z, states no range for one, or does not reach all of these positions.
     """

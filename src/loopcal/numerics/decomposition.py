@@ -71,8 +71,6 @@ class Decomposition(TrialBatch):
     that all formulas hold; V itself is oblique, and its inverse is kept as `dual`. V is oblique as
     well where the penalty acts on other unknowns: with z = L u its columns are L times those for u.
 
-    Attributes
-    ----------
     singular_values : (t, p) s, descending.
     directions : (t, p, p) V, column i belongs to s_i.
     projections : (t, p) c = U'b.
@@ -347,8 +345,6 @@ def decompose(
 ) -> Decomposition:
     """Decompose a triangular factor of rows [A | b].
 
-    Parameters
-    ----------
     factor : (t, p + 1, p + 1) upper triangular, see `loopcal.engine.fold`.
     rows : (t,) number of equations that were folded.
     about : (t, p), optional. With it the last column is read as a residual r at the deviation z =
@@ -434,8 +430,6 @@ LEAF = 64
 def substitute_backward(R: FloatArray, b: FloatArray) -> FloatArray:
     """Return x with R x = b, for upper triangular R (n, n) and b (n, k).
 
-    Raises
-    ------
     numpy.linalg.LinAlgError : a zero on the diagonal.
     """
     n = len(R)
@@ -490,8 +484,6 @@ def solve_regular(
     """Return x (t, p) with R x = b, and of which R all singular values are certainly above
     `tolerance` times the largest; x is zero in the other trials.
 
-    Parameters
-    ----------
     triangle : (t, p, p) R upper triangular. right : (t, p) b.
     tolerance : a singular value counts as zero up to this share of the largest one.
     """

@@ -36,8 +36,6 @@ SCOPES = ("machine", "session", "group", "pose")
 class Structure:
     """n nodes with as many unknowns, and as many columns in their paths, each.
 
-    Attributes
-    ----------
     unknowns : (n, u) the unknowns of each node.
     path : (n, w) the unknowns of each node, followed by those of its ancestors, innermost first.
     parent : number of the structure of the parents, -1 without any.
@@ -62,8 +60,6 @@ class Structure:
 class EliminationTree:
     """The nodes of U unknowns. A node has a larger number than its ancestors.
 
-    Attributes
-    ----------
     node : (U,) node of each unknown, -1 where it is fixed. column : (U,) its column in that node.
     cluster : (U,) cluster of each unknown, -1 where it is fixed.
     width : (nodes,) number of columns of each path.
@@ -238,8 +234,6 @@ rounding."""
 class NodeFactors:
     """The triangular factors of all nodes: working memory while rows are folded.
 
-    Parameters
-    ----------
     tree : of the U unknowns. trials : a. parameters : p of the machine.
     """
 
@@ -293,8 +287,6 @@ class NodeFactors:
 class NodeSolution:
     """Nodes of one structure after their elimination: x = -solution @ [ancestors, z, 1].
 
-    Attributes
-    ----------
     inverse : (a, n, u, u) pseudo-inverse of the triangle of the node's own columns.
     solution : (a, n, u, w - u + p + 1).
     unobservable : (a, n, u, u) unobservable directions, one per row, in columns of length one; zero
@@ -310,8 +302,6 @@ class NodeSolution:
 class TreeElimination(TrialBatch):
     """U eliminated unknowns: their best values are a linear function of the machine's deviation.
 
-    Attributes
-    ----------
     tree : of the unknowns.
     slope : (a, U, p) change of the best values by the machine's deviations.
     shift : (a, U) step from the present values to the best ones at the present machine.
@@ -600,8 +590,6 @@ SMALLEST_ROW = 1e-14
 class Elimination:
     """Rows [F | A] without the k columns F.
 
-    Attributes
-    ----------
     rest : (.., m, w) rows left of A, free of the eliminated unknowns.
     solution : (.., k, w); the best eliminated unknowns are x = -solution @ z.
     inverse : (.., k, k) pseudo-inverse of the triangle of F.

@@ -42,8 +42,6 @@ class DescentStatus(IntEnum):
 class Halving(NamedTuple):
     """Settings of `minimize_by_halving`.
 
-    Parameters
-    ----------
     steps : at most. attempts : lengths that are tried for each step, each half the one before.
     relative, absolute : converged when a step changes the whitened residuals by less than this
         share of their norm, plus this many standard deviations.
@@ -81,8 +79,6 @@ def minimize_by_halving(
 
     All trials are evaluated together in each attempt. What has ended is moved by a share of zero.
 
-    Parameters
-    ----------
     propose : from a point to its full step, with `change` (t,), the squared change of the residuals
         to first order, and `share` (t, m) of each of its m parts that is tried first, at most one.
     move : from a point, its step and shares (t, m) of it to the next point.

@@ -25,8 +25,6 @@ NODES = 101
 def compute_chi_square_tail(degrees: ArrayLike, statistic: ArrayLike) -> FloatArray:
     """Return the probability that chi-square exceeds a statistic; 1 without a degree of freedom.
 
-    Parameters
-    ----------
     degrees : degrees of freedom. statistic : sum of squares [1]. Both broadcast.
     """
     degrees = np.asarray(degrees, dtype=float)
@@ -74,8 +72,6 @@ def compute_averaged_tail(
 
     The true variance of a source is nu / chi-square(nu) times the estimated one.
 
-    Parameters
-    ----------
     sources : the part of each source in the degrees of freedom of the chi-square, and the degrees
         of freedom nu of its variance.
     """
@@ -130,8 +126,6 @@ SMALLEST, LARGEST = 1e-3, 1e4
 class VarianceComponent(NamedTuple):
     """The estimate of a variance component.
 
-    Attributes
-    ----------
     variance : mean of sigma^2 tau^2. degrees : its degrees of freedom.
     ratio : of variances, tau^2 at which the likelihood is largest. gain : of the logarithm of this
         likelihood over that without the component.
@@ -153,8 +147,6 @@ def compute_component_tail(
 ) -> float:
     """Return the probability of a larger Q without the component; 1 where there is no test.
 
-    Parameters
-    ----------
     weights, y : (k,) elements. rest : sum of squares and number of elements of weight 0; those of a
         stated sigma of `known` degrees of freedom are `known` and `known`.
     """

@@ -52,8 +52,6 @@ def _list_batched(kind: type[Any]) -> tuple[str, ...]:
 class TrialBatch:
     """Base of frozen dataclasses whose arrays begin with an axis of t trials.
 
-    Attributes
-    ----------
     shared : names of the fields that belong to no trial.
     """
 

@@ -70,8 +70,6 @@ class Paper:
         step. robot : another robot, or its file, that takes the place of those of the paper.
         epsilon : in place of the limit at which the steps of a paper with such a rule end.
 
-        Raises
-        ------
         DataError : a seed below zero, fewer than 2 trials, a robot that does not fit the study, or
             an epsilon for a study without this rule.
         FileError : the robot cannot be read.

@@ -207,8 +207,6 @@ def build_parameter_table(
 ) -> Table:
     """Return identified parameters: rows of `Identification.to_dict()["parameters"]`.
 
-    Parameters
-    ----------
     is_complete : whether standard uncertainty, degrees of freedom, coverage factor, and the shift
         in tolerances have columns, too.
     """

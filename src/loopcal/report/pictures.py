@@ -78,12 +78,8 @@ def render_figure(figure: Figure, ending: str) -> bytes:
 def save_figure(path: Path, figure: Figure, *, write: Callable[[Path, bytes], object]) -> None:
     """Write a figure to a file.
 
-    Parameters
-    ----------
     write : writes bytes to a file, such as `loopcal.io.core.text_file.write_bytes`.
 
-    Raises
-    ------
     FileError : the ending of the name is not one of `FORMATS`.
     """
     ending = path.suffix.lower()
@@ -153,8 +149,6 @@ def _copy(
 ) -> ElementTree.Element:
     """Return an element without namespaces, styles and what does not draw.
 
-    Parameters
-    ----------
     styles : the attributes of each style that occurred before; gets new ones.
     """
     copied = ElementTree.Element(element.tag.rpartition("}")[2])

@@ -71,8 +71,6 @@ def view_validation(
 ) -> list[Block]:
     """Return the page of a validation.
 
-    Parameters
-    ----------
     with_before : whether there is a geometry before calibration to compare with.
     """
     blocks = view_errors(validation, "measured", with_before)
@@ -90,8 +88,6 @@ def view_validation(
 def view_errors(validation: Validation, what: str, with_before: bool = True) -> list[Block]:
     """Return the tables of errors; their captions name the rows, the count and the frame.
 
-    Parameters
-    ----------
     what : of the rows, such as "held-out". with_before : whether there is a geometry before
         calibration to compare with.
     """

@@ -31,8 +31,6 @@ Source = str | Callable[[Any], Any]
 class Field:
     """One number, array or text of a result.
 
-    Parameters
-    ----------
     name : of the variable of a dataset and column of a data frame. of : where the result has it;
         default: the attribute `name`. Of a tuple of objects, the rest of a path yields one value
         for each, as in `candidates.rank`.
@@ -150,8 +148,6 @@ class Variable:
 class Records:
     """The arrays of a result.
 
-    Attributes
-    ----------
     variables : the arrays. labels : dimension -> names along it.
 
     The first dimension of the first variable is that of the rows of the main table. Variables along

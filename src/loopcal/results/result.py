@@ -75,8 +75,6 @@ class TableResult(Result):
     def to_frame(self) -> Any:
         """Return the main table as a pandas DataFrame; headings state the units.
 
-        Raises
-        ------
         MissingPackageError : pandas is not installed.
         """
         from loopcal.results.notebook import build_frame
@@ -86,8 +84,6 @@ class TableResult(Result):
     def to_dataset(self) -> Any:
         """Return the arrays as an xarray Dataset; the attribute `units` of each states its unit.
 
-        Raises
-        ------
         MissingPackageError : xarray is not installed.
         """
         from loopcal.results.notebook import build_dataset

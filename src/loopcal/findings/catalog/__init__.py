@@ -59,8 +59,6 @@ _ENTRY = re.compile(r"^\[([\w-]+\.[\w-]+)\]", re.MULTILINE)
 class Entry:
     """One message of the catalog.
 
-    Parameters
-    ----------
     code : `subject.what`. severity : how much it matters. text : the sentence, a template.
     when : when it is reported. action : what to do next. Both are empty where the text says it.
     example : data of one case. routine : whether short pages leave it out, as all is well.
@@ -94,8 +92,6 @@ class Entry:
 def find_entry(code: str) -> Entry:
     """Return the entry of a code.
 
-    Raises
-    ------
     KeyError : the code is not in the catalog.
     """
     subject, _, name = code.partition(".")

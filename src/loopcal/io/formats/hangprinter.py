@@ -85,8 +85,6 @@ COMMENTS = {
 class Samples:
     """The content of a file: n lines and N poses, of which the first K are known; [mm], [rad].
 
-    Attributes
-    ----------
     radius, mechanical_advantage, lines_per_spool : (n,). gear : turns of the spool for one of the
         motor.
     motors : (N, n). known : (K, 3). anchors : (n, 3) where the file states them, else None.

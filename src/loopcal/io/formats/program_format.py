@@ -45,8 +45,6 @@ distance on a printed part, of line lengths, known positions and taped lengths o
 class ImportOptions:
     """Options of reading a file.
 
-    Attributes
-    ----------
     name : of the robot.
     sigma_height, sigma_distance, sigma_line, sigma_position : noise [m] of probed heights and
         distances, and of lines and known positions of a cable robot, which no format states.
@@ -113,8 +111,6 @@ class Imported:
 class ExportSource:
     """A robot to export, with intervals where a run provides them.
 
-    Attributes
-    ----------
     plus_minus : parameter -> half of the 95 % interval, in the unit of the robot file; None where
         there is none. nulls : parameter -> reason why there is none.
     is_for_people : whether the numbers are to be read and typed: an identified value then has the

@@ -356,8 +356,6 @@ def sweep_noise(setup: Setup, seed: int, trials: int) -> dict[str, Level]:
 class Draws:
     """Results of one method with t draws of noise; NaN for lost ones.
 
-    Attributes
-    ----------
     parameters : (t,) rms errors of the lengths [mm]. places : (t,) rms errors of positions [mm] at
         equal readings, by where the poses lie. smaller, halved : (t,) share of the parameters
         whose error is smaller than before, and at most half as large. largest : (t,) largest error

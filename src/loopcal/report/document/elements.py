@@ -36,8 +36,6 @@ if TYPE_CHECKING:
 class Picture:
     """A figure as SVG elements for HTML.
 
-    Parameters
-    ----------
     name : prefix of its identifiers. svg : see `inline_figure`. caption : shown below it.
     description : what it shows, for readers who do not see it.
     scene : JSON of a scene, which replaces the figure where a browser has WebGL; empty without.
@@ -79,8 +77,6 @@ Element = str | Table | Picture | Listing | Code | Form
 class Section:
     """A heading with its content.
 
-    Parameters
-    ----------
     name : identifier, to link to it. elements : the content in order; without any the section is
         left out.
     """
@@ -98,8 +94,6 @@ class Section:
 class Document:
     """Sections below a title.
 
-    Parameters
-    ----------
     verdict : name of the verdict, such as `not_calibrated`, which decides the color of the head;
         empty without a verdict.
     summary : the one sentence below the title. made_by : program and version.
@@ -192,8 +186,6 @@ def _load_template() -> Template:
 class ControllerValues:
     """Identified values as a controller reads them.
 
-    Parameters
-    ----------
     format : name of the format. what : a line about it. text : of the file. notes : what it cannot
         express, and what it changes.
     """
@@ -208,8 +200,6 @@ class ControllerValues:
 class CalibrationRecord:
     """Content of a run.
 
-    Attributes
-    ----------
     result : content of result.json, with numbers that are not finite.
     arrays : content of arrays.npz [SI].
     robot : the corrected robot, of which the identified parameters are free. initial : the robot

@@ -143,8 +143,6 @@ def draw_residual_rows(
     Residuals of actuator readings are in the first two only: the estimated poses take up a part of
     them, so that they are smaller than their sigma.
 
-    Parameters
-    ----------
     residuals : of a fit or of a run folder. setup : names of the fitted setup parameters.
     """
     series = [s for s in list_series(robot, residuals) if len(s.raw)]
@@ -293,8 +291,6 @@ def draw_parameter_rows(
 
     Of a fit that did not converge only the last values are drawn, without intervals.
 
-    Parameters
-    ----------
     robot : its name. rows : see `Identification.list_parameters`; or those of a run folder.
     """
     p, columns = len(rows), max(-(-len(rows) // MOST_ROWS), 1)

@@ -65,8 +65,6 @@ def _measure(
 ) -> Bbox | None:
     """Return the box around axes and their labels [pixels].
 
-    Parameters
-    ----------
     measure : the method of matplotlib. known : the margins by positions of ticks; gets new ones.
     renderer, options : of `measure`.
     """

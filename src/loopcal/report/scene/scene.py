@@ -45,8 +45,6 @@ SMALLEST = 1e-9
 class PoseErrors:
     """Measured poses that the geometries before and after calibration both reach.
 
-    Attributes
-    ----------
     labels : of the n poses. solution : of the calibrated robot.
     tool : (n, 3) tool points [m]. error : (n, 3) those of the geometry before minus these [m].
     magnification : by which factor the errors are drawn longer than the poses' scale.
@@ -63,8 +61,6 @@ class PoseErrors:
 class Motion:
     """How a change of parameters moves a robot at home, while its readings stay.
 
-    Attributes
-    ----------
     name : short, for a list. text : a sentence.
     shift : (P, 3) of the points of all parts [m]. magnification : by which it is drawn.
     """
@@ -79,8 +75,6 @@ class Motion:
 class Scene:
     """A robot at home.
 
-    Attributes
-    ----------
     poses : with their errors; None without a calibration.
     accuracy : uncertainty over the workspace; None where it is not known.
     motions : by the errors before calibration, and by combinations that are not determined.
@@ -201,8 +195,6 @@ PLANAR = {"x", "y", "rz"}
 class Part:
     """A line through m points, or one point, at n poses.
 
-    Attributes
-    ----------
     role : one of `Role`. points : (n, m, 3) [m], in the base frame.
     index : number of its limb, or of the axis of a frame; -1 where it belongs to neither.
     is_driven : whether it is a joint, slide or rod with an actuator.
@@ -222,8 +214,6 @@ def is_planar(robot: Mechanism) -> bool:
 def list_parts(robot: Mechanism, state: State) -> tuple[Part, ...]:
     """Return the parts of a robot at n poses: first the line of each limb, in their order.
 
-    Parameters
-    ----------
     state : (1, n), of `robot.home_state` or of a solution.
     """
     T = state.T[0]

@@ -106,8 +106,6 @@ the rule of the study hexapod-42.
 class StepRule:
     """When the steps end.
 
-    Parameters
-    ----------
     epsilon : largest component of a step [mm, rad] at which they end; 0 takes `limit` steps.
     limit : steps at most. ahead : see `AHEAD`; 0 computes H for every step.
     """
@@ -134,8 +132,6 @@ class StepRule:
 class RawSteps:
     """Result of the steps of t trials; index k of a history is the state at the k-th H.
 
-    Attributes
-    ----------
     values : (t, p) identified parameters [SI], NaN where diverged. history : (k + 1, t, p) [SI],
         NaN from the step on that diverged.
     steps : (k, t) largest component of the first step with each H [mm, rad], NaN after the end and
@@ -160,8 +156,6 @@ class RawSteps:
 class RawProblem:
     """Raw rows of t trials.
 
-    Attributes
-    ----------
     problem : with a noise of one millimeter and one radian as whitener, and with parameters in
         millimeters and radians. start : the poses of the nominal robot. method : in whose
         coordinates H is decomposed, a ridge with one lam per parameter or any other method.
@@ -211,8 +205,6 @@ def make_raw_problem(robot: Mechanism, trials: Trials, method: Method | None = N
 def take_steps(raw: RawProblem, penalty: FloatArray, rule: StepRule | None = None) -> RawSteps:
     """Take full steps from the values of the robot until they are small.
 
-    Parameters
-    ----------
     raw : of t trials. penalty : (t | 1, p) of the directions: 0 for least squares, lam for ridge (1
         where `raw.method` has one lam per parameter), infinite for directions that truncated SVD
         does not use. rule : when the steps end.
@@ -318,8 +310,6 @@ SHARED = 1e-9
 class LegForm:
     """The matrices at one machine.
 
-    Attributes
-    ----------
     G : (n, 6, p) change of each leg's length with the parameters.
     S : (n, 6, 6) twist by leg lengths. D : (n, 6, p) twist by parameters.
     members : for each leg, the positions of its free parameters.
@@ -378,8 +368,6 @@ def integrate_errors(errors: FloatArray) -> FloatArray:
 class PerLegEstimate:
     """Result of the identification leg by leg.
 
-    Attributes
-    ----------
     robot : at the estimated values. estimate_history : (steps + 1, p) parameters after each step
         [SI]. conditions : (6,) condition number of each leg's matrix in the last step.
     integrated_errors : (steps + 1,) max dQint [mm + rad] at these parameters, see
@@ -431,14 +419,10 @@ def identify_per_leg(
 ) -> PerLegEstimate:
     """Identify a hexapod leg by leg by full Gauss-Newton steps.
 
-    Parameters
-    ----------
     robot : start values. data : full poses of one kind. steps : at most.
     epsilon : limit at which the steps end; 0 takes all steps. stop : what epsilon limits, see
         `Stop`.
 
-    Raises
-    ------
     EstimationError
         The robot has not six actuators, the data are not full poses in known frames or too few, a
         parameter moves no leg or several, a pose is out of reach, or epsilon is below zero
@@ -558,8 +542,6 @@ WEIGHTS: tuple[Weights, ...] = get_args(Weights)
 class Layout:
     """Which points a machine is sent to.
 
-    Attributes
-    ----------
     robot : as designed; the origin of its tool is the end point. coordinates : (g, k, 6)
         controlled [m, rad] of g groups: p_0, p_1 on the line, the others in the plane.
     """
@@ -649,8 +631,6 @@ class Layout:
 class PaperRows:
     """Equations (17) of t machines as a problem for the library's descent.
 
-    Attributes
-    ----------
     layout : the points. q : (t, n, a) readings. sd : of all parameters or of each (p,) [SI], in
         which deviations are counted; 0 keeps a parameter at its nominal value.
     weights : of the rows. sigma : of the noise of a point [m].
