@@ -107,7 +107,7 @@ def select_engine(choice: str = "") -> Engine:
     try:
         engine = load()(variant)
         if not isinstance(engine, Engine):
-            raise TypeError(f"{engine!r} is no engine")
+            raise TypeError(f"{engine!r} is not an engine")
     except Exception as cause:  # the code of others, or a record of functions of another version
         reason = "it belongs to another version of loopcal, or fails. Install both anew"
         if isinstance(cause, ImportError | OSError | ValueError):  # their texts say what to do

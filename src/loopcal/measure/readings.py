@@ -206,8 +206,8 @@ def resolve_reading_sigma(robot: Mechanism, given: FloatArray | None, n: int) ->
         exact = robot.actuators[int(np.argwhere(given == 0.0)[0, 1])].name
         raise DataError(
             f"the readings of {exact} are declared exact, but {robot.name!r} has "
-            f"{len(robot.actuators)} actuators for {len(robot.freedoms)} degrees of freedom; "
-            "readings of redundant actuators cannot be exact. Give each a sigma above 0, a "
+            f"{len(robot.actuators)} actuators for {len(robot.freedoms)} degrees of freedom. "
+            "Readings of redundant actuators cannot be exact. Give each a sigma above 0, a "
             "small one for very good encoders"
         )
     return given if np.any(given != 0.0) else None

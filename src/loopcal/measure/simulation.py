@@ -430,8 +430,8 @@ def simulate_contacts(
     other = [o.kind.name for o in sheet.observations if not isinstance(o.kind, Plane | Line)]
     if other:
         raise DataError(
-            f"rows of the kind {other[0]!r} have no readings; only points on planes and lines are "
-            "simulated without readings"
+            f"rows of the kind {other[0]!r} have no readings. Simulation without readings is for "
+            "points on planes and lines"
         )
     missing = [name for name in POSITION if name not in robot.controlled]
     if missing:

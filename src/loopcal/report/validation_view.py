@@ -265,7 +265,7 @@ def view_repeatability(result: Repeatability, robot: Mechanism | None = None) ->
 
 SHIFTS = (
     "Shifts from {first}, with all other parameters free to have changed as well. They follow "
-    "from the data alone; estimates are also drawn to nominal by the tolerances. A shift is "
+    "from the data alone. Tolerances also draw estimates to nominal. A shift is "
     "significant (*) at 5 % for all parameters and runs together. A dash: undetermined by the "
     "data of both runs, or not tested."
 )
@@ -383,7 +383,7 @@ def tabulate_comparison(comparison: RunComparison) -> Table:
 # Regularization curves as tables.
 
 SCORE = (
-    "Held-out error: mean square of residuals over sigma at poses that were left out; 1 is noise."
+    "Held-out error: mean square of residuals over sigma at poses that were left out. 1 is noise."
 )
 WORDS = {"lam": ("Ridge", "lam"), "k": ("Truncated SVD", "k")}
 """Name of a curve -> the method in words, and its number."""

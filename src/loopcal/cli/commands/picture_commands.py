@@ -70,6 +70,6 @@ def board(
     page = [
         f"{files[0]}: {columns} x {rows} squares, drawn in {files[1]} and {files[2]}",
         "Print at 100 %, without fit to page, and glue the print to a flat plate",
-        f"Measure {x:g} mm along x and {y:g} mm along y; enter both as 'measured' in {files[0]}",
+        f"Measure {x:g} mm along x and {y:g} mm along y. Enter both as 'measured' in {files[0]}",
     ]
     return Output(document, lambda: page)

@@ -163,7 +163,7 @@ class Cells(Sequence[str]):
         if isinstance(place, slice):
             return tuple(self)[place]
         if not 0 <= place < len(self):
-            raise IndexError(f"there is no row {place}")
+            raise IndexError(f"row {place} does not exist")
         number = bisect_right(self._begins, place) - 1
         return self._texts[number].split("\n")[place - self._begins[number]]
 

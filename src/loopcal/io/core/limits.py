@@ -88,14 +88,14 @@ YAML_SIZE = FileLimit(
     "size of YAML text",
     1,
     "MB",
-    "robot files, settings, profiles, lists of loop closures; front matter with its remarks",
+    "robot files, settings, profiles, lists of loop closures, front matter with its remarks",
     "shorten its comments, or remove what does not belong there",
 )
 YAML_NODES = FileLimit(
     "values in YAML text",
     50_000,
     "values",
-    "keys, values and lists; an alias counts as all values that it stands for",
+    "keys, values and lists. An alias counts as all values that it stands for",
     "write less, or use fewer aliases",
 )
 YAML_DEPTH = FileLimit(
@@ -195,7 +195,7 @@ JSON_VALUES = FileLimit(
     "values in JSON text",
     25_000_000,
     "values",
-    "`result.json` of a run, samples of a cable robot; keys included",
+    "`result.json` of a run, samples of a cable robot, keys included",
     "check that this is the file that was meant",
 )
 JSON_DEPTH = FileLimit(
@@ -230,7 +230,7 @@ ARRAYS_SIZE = FileLimit(
     "size of `arrays.npz`",
     4_000,
     "MB",
-    "arrays of a run folder, as a file and in memory; they are never compressed",
+    "arrays of a run folder, as a file and in memory, never compressed",
     "repeat the calibration with fewer poses",
 )
 ARRAYS_COUNT = FileLimit(

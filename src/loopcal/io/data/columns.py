@@ -318,13 +318,12 @@ def _text_rule(meaning: str, column: TextColumn) -> ColumnRule:
 
 RULES: tuple[ColumnRule, ...] = (
     _text_rule(
-        f"name of the pose; `a{LINK}b` in a row that compares two poses; rows are numbered without "
-        "it",
+        f"name of the pose, or `a{LINK}b` in a row that compares two poses. Default: the number of "
+        "the row",
         TextColumn("pose"),
     ),
     _text_rule(
-        f"`{FIT}` or `{HELD_OUT}`: what the pose is for, in every file alike; `{FIT}` where no row "
-        "of the pose states it",
+        f"`{FIT}` or `{HELD_OUT}`: what the pose is for, in every file alike. Default: `{FIT}`",
         USE_COLUMN,
     ),
     _text_rule("poses of a block are never split between fit and validation", BLOCK_COLUMN),
@@ -342,7 +341,7 @@ RULES: tuple[ColumnRule, ...] = (
     ColumnRule(
         "force.AXIS, moment.AXIS, load.ACTUATOR",
         "[N], [Nm]",
-        "force and moment on the platform of an elastic robot; or the load of each elastic drive",
+        "force and moment on the platform of an elastic robot, or the load of each elastic drive",
         lambda robot, _: [
             _number(name, Dimension(name.partition(".")[0]))
             for name in (FORCES if robot.is_elastic else ())
@@ -367,8 +366,8 @@ RULES: tuple[ColumnRule, ...] = (
     ColumnRule(
         f"{SIGMA}NAME",
         "of NAME",
-        "standard deviation of a measured value or reading in this row; `inf` marks a reading "
-        "that is not trusted",
+        "standard deviation of a measured value or reading in this row. `inf` marks a reading "
+        "without trust",
         lambda robot, kinds: [
             *(
                 NumberColumn(SIGMA + a.name, a.dimension, robot.units[a.dimension], True)
@@ -394,7 +393,7 @@ RULES: tuple[ColumnRule, ...] = (
     ColumnRule(
         TIME,
         "[s], [ms], [min], [h] or none",
-        "time of the row; date and time of ISO 8601 without a unit",
+        "time of the row, without a unit: date and time of ISO 8601",
         lambda _robot, _kinds: (ContextColumn(TIME),),
     ),
     ColumnRule(
@@ -407,7 +406,7 @@ RULES: tuple[ColumnRule, ...] = (
     ColumnRule(
         f"{NOTE}...",
         "any",
-        "a remark; ignored",
+        "a remark, which loopcal ignores",
         lambda _robot, _kinds: (),
         lambda name: TextColumn(name) if name.startswith(NOTE) else None,
     ),

@@ -577,12 +577,12 @@ SHARED_ERRORS: Mapping[str, str] = {
     "session_drift": "the same for a change from the first to the last row of a session, linear "
     "in time or, without the column `time`, in the order of the rows",
     "scale": "a factor on all measured lengths: `sd` of its deviation from 1, and, unless 0, its "
-    "`mean`; with `scope: all` one factor holds in all sessions",
+    "`mean`. With `scope: all` one factor holds in all sessions",
     "temperature": "of the machine or part: `value`, `sd`, its `expansion` minus that of the "
     "instrument's scale, and, unless 0, `expansion_sd`. Measured lengths are longer by `expansion "
-    "* (value - reference)`; `reference` is 20 degC, `scope` as of `scale`",
+    "* (value - reference)`. `reference` is 20 degC, `scope` as of `scale`",
     MPE: "maximum permissible error of the certificate, `constant` and `per_length`, in place of "
-    "the noise of lengths and of the scale; `scope` as of `scale`",
+    "the noise of lengths and of the scale, with `scope` as of `scale`",
 }
 
 
@@ -751,17 +751,17 @@ def _read_in_units(file: YamlFile, node: Any, units: Scales, place: Location) ->
 
 SETTINGS: Mapping[str, str] = {
     "format": "1",
-    "robot": "name of the robot; loopcal reports a difference from the robot in use",
-    "instrument": "name of the instrument, or its facts for traceability; see "
+    "robot": "name of the robot. loopcal reports a difference from the robot in use",
+    "instrument": "name of the instrument, or its facts for traceability: see "
     "[instruments](#instruments-and-their-traceability)",
-    "controller": "robot file of the geometry that converts commanded coordinates to readings; "
-    "the nominal robot by default",
+    "controller": "robot file of the geometry that converts commanded coordinates to readings. "
+    "Default: the nominal robot",
     "kind": "the kind of all rows, followed by its own settings and noise",
     "kinds": "label -> kind, settings and noise, in files with several kinds",
-    "noise": "standard deviation of each noise column, with its unit; by name or pattern, such as "
-    '`"*.x": 5 um`; of a position also `range`, `angle` and `centering`, as of a tracker. In place '
+    "noise": "standard deviation of each noise column, with its unit, by name or pattern, such as "
+    '`"*.x": 5 um`. Of a position also `range`, `angle` and `centering`, as of a tracker. In place '
     "of a standard deviation `{limit: 15 um}` (uniform within it) or `{U: 10 um, k: 2}`",
-    "noise_source": "`assumed` where nobody stated the noise, as in imported files; by default "
+    "noise_source": "`assumed` for a noise that users did not give, as in imported files. Default: "
     "`stated`. Assumed noise decides no quality gate",
     **SHARED_ERRORS,
     "unknowns": "name or pattern -> prior knowledge of a setup parameter (frame, target, surface, "
@@ -769,7 +769,7 @@ SETTINGS: Mapping[str, str] = {
     "session": "session of all rows without an entry in the column",
     "group": "group of all rows without an entry in the column",
     "reading_noise": "standard deviation of the readings: one for all, or actuator or pattern -> "
-    "one; that of the robot file by default",
+    "one. Default: from the robot file",
     "poses": "another file in this folder, with the readings of the poses",
 }
 ROW_SETTINGS = ("camera", "board")

@@ -40,26 +40,26 @@ class Image(Kind):
     """Pixels u, v of the corners of a printed board. Residual: `predicted - measured`.
 
     A row is one corner of one picture. The corner i of a board with c columns is at column `i mod
-    c` and row `i div c`, (0, 0) being the origin of the board, x along its columns and y along its
-    rows. A printer scales both axes, and paper bends: with column and row h, k from -1 to 1,
-    `p = (x (1 + scale_x), y (1 + scale_y), bend_x h^2 + bend_y k^2 + bend_xy h k)`. The camera is
-    that of `loopcal.measure.camera_geometry`. Its z axis is the line of sight, x is right and y
-    down in the picture.
+    c` and row `i div c`. The corner (0, 0) is the origin of the board, x runs along its columns and
+    y along its rows. A printer scales both axes, and paper bends: with column and row h, k from -1
+    to 1, `p = (x (1 + scale_x), y (1 + scale_y), bend_x h^2 + bend_y k^2 + bend_xy h k)`. The model
+    of the camera is `loopcal.measure.camera_geometry`. Its z axis is the line of sight, x is right
+    and y down in the picture.
 
-    Setup parameters: `camera.rx` to `camera.z` and `board.rx` to `board.z` [rad, m]; `camera.fx`,
-    `fy`, `cx`, `cy` [px], `k1`, `k2`, `k3`, `p1`, `p2`; `board.scale_x`, `board.scale_y`, and
+    Setup parameters: `camera.rx` to `camera.z`, `board.rx` to `board.z` [rad, m], `camera.fx`,
+    `fy`, `cx`, `cy` [px], `k1`, `k2`, `k3`, `p1`, `p2`, `board.scale_x`, `board.scale_y`, and
     `board.bend_x`, `bend_y`, `bend_xy` [m].
 
     Parameters
     ----------
-    mount : what the platform carries, the "board" or the "camera"; the other one is fixed.
+    mount : what the platform carries, the "board" or the "camera". The base carries the other one.
     T_camera, T_board : (4, 4), camera and board in the body that carries them (platform or base).
         If unknown, the nominal values.
-    camera, board : their names. Kinds with the same name share the parameters.
+    camera, board : their names. Kinds with equal names share the parameters.
     lens : name of the lens, by which several cameras share its parameters, such as one phone at
-        two stations; default: the name of the camera.
-    size : width and height of a picture. focal : (fx, fy); default: the width of the picture.
-    center : (cx, cy); default: the middle of the picture. distortion : (k1, k2, k3, p1, p2).
+        two stations. Default: the name of the camera.
+    size : width and height of a picture. focal : (fx, fy). Default: the width of the picture.
+    center : (cx, cy). Default: the middle of the picture. distortion : (k1, k2, k3, p1, p2).
     corners : columns and rows of corners. square : distance of neighbors, as designed.
     unknown : which of "camera", "board", "focal", "center", "radial" (k1, k2, k3), "tangential"
         (p1, p2), "print" (the scales) and "bend" are unknown.

@@ -259,7 +259,7 @@ class Position(TargetKind):
         if self.station is None and is_base:
             raise DataError(
                 "noise by range and angle needs the place of the instrument, but the frame is the "
-                "base; state `station`, as [1200 mm, 0 mm, 900 mm]"
+                "base. Give `station`, as [1200 mm, 0 mm, 900 mm]"
             )
         station = np.zeros(3) if self.station is None else self.station
         lever = np.nan_to_num(measured).reshape(len(measured), -1, 3) - station

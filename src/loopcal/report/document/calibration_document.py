@@ -94,14 +94,14 @@ def build_sections(record: CalibrationRecord, names: Iterable[str]) -> tuple[Sec
 # The page to sign: what was calibrated, by whom and how, the result, and the decision rule.
 
 RULE = (
-    "Decision rule: {rule}. Conformity is stated where the largest error keeps the limit with a "
-    "probability of at least {level:.3g} %, nonconformity where it exceeds the limit with this "
-    "probability, and neither otherwise."
+    "Decision rule: {rule}. The result is conformity if the largest error keeps the limit with a "
+    "probability of at least {level:.3g} %. It is nonconformity if the error exceeds the limit "
+    "with this probability, and neither otherwise."
 )
-NO_RULE = "No limit was stated, so this document has no conformity."
-NO_VOLUME = "No working volume was stated, so the result holds for the measured poses."
+NO_RULE = "The run has no limit, so this document does not decide on conformity."
+NO_VOLUME = "The run has no working volume, so the result holds for the measured poses."
 NO_RESULT = (
-    "No pose was held out of the fit and no working volume was stated, so the document has no "
+    "The fit held out no pose and the run has no working volume, so the document has no "
     "error of the calibrated machine."
 )
 VALIDITY = (
@@ -123,7 +123,7 @@ def describe_summary(record: CalibrationRecord) -> Iterator[Element]:
     )
     method = f"{name_count(len(record.result['fit']['parameters']), 'geometric parameter')} "
     method += f"identified from measurements ({kinds or 'unknown'}) at {fitted}, "
-    method += f"validated at {held_out} that were not fitted; uncertainty by JCGM 100 (GUM)"
+    method += f"validated at {held_out} outside the fit, with uncertainty by JCGM 100 (GUM)"
     stated = {
         **{name: text for name, text in facts.items() if name not in SIGNATURE},
         "machine": facts.get("machine") or record.robot.name,
@@ -331,7 +331,7 @@ def describe_errors(record: CalibrationRecord) -> Iterator[Element | None]:
         if not record.held_out_labels:
             yield NOT_HELD_OUT
         elif record.result.get("validation") is None:
-            yield "The errors at the held-out poses could not be computed; see the findings."
+            yield "loopcal could not compute the errors at the held-out poses. See the findings."
         else:
             yield NOT_STORED
         return
@@ -457,15 +457,15 @@ def _describe_undetermined(record: CalibrationRecord) -> str:
     fit = record.result["fit"]
     count, rank = len(fit["parameters"]), fit["rank"]
     if not record.converged:
-        return "The fit did not converge, so it does not state what the data determine."
+        return "The fit did not converge, so it does not show what the data determine."
     if rank == count:
         return f"The data determine all {count} parameters."
     return f"The data determine {rank} of {count} combinations of the parameters."
 
 
 OTHERS = (
-    "The report leaves out {others} that only move frames or bodies, or are beyond the first few; "
-    "result.json of the run states each."
+    "The report leaves out {others} that only move frames or bodies, or follow the first few. "
+    "result.json of the run lists each."
 )
 
 
@@ -493,7 +493,7 @@ def describe_outliers(record: CalibrationRecord) -> Iterator[Element]:
     if excluded := record.result["fit"].get("dropped"):
         yield f"Excluded from the fit by its options: {', '.join(excluded)}."
     elif not stated:
-        yield "Outlying rows were not searched for, because the fit did not converge."
+        yield "loopcal did not search for outlying rows, because the fit did not converge."
 
 
 @describes_section("residuals", "Residuals of the fit")
@@ -541,7 +541,7 @@ def describe_controllers(record: CalibrationRecord) -> Iterator[Element]:
             yield Code(f"{values.format}: {values.what}", "\n".join(lines))
         else:
             yield (
-                f"{values.format} ({values.what}): {len(lines)} lines, too many for this page; the "
+                f"{values.format} ({values.what}): {len(lines)} lines, too many for this page. The "
                 "command loopcal export writes them to a file."
             )
         if notes := tuple(("note", note) for note in values.notes if note not in of_all):

@@ -110,7 +110,7 @@ def draw_residual_picture(record: CalibrationRecord) -> Iterator[Element]:
         "The panels show the residuals in the order of the poses, by component, as "
         "histogram and normal plot, and against readings and recorded quantities. Whitened "
         "residuals "
-        "are divided by their sigma; of errors with the stated noise 95 % lie between the dashed "
+        "are divided by their sigma. Of errors with the stated noise 95 % lie between the dashed "
         f"lines. {shrinkage}",
     )
 
@@ -163,9 +163,9 @@ def draw_height_picture(record: CalibrationRecord) -> Iterator[Element]:
         draw_height_errors(heights),
         "height-figure",
         "Height errors over x and y before and after calibration.",
-        "Each point is a measured height at its place x, y; its color is the error, "
-        "predicted minus measured, with the same scale before and after calibration. Circles were "
-        "used in the fit, squares were held out.",
+        "Each point is a measured height at its place x, y. Its color is the error, "
+        "predicted minus measured, in one scale before and after calibration. The fit used the "
+        "circles and held out the squares.",
     )
 
 
@@ -178,7 +178,7 @@ def draw_budget_picture(record: CalibrationRecord) -> Iterator[Element]:
             draw_budget_sources(budget),
             "budget-figure",
             "Expected error by source.",
-            "A bar is the part of a source in the root mean square error; a diamond is the error "
+            "A bar is the part of a source in the root mean square error. A diamond is the error "
             "of all sources if the sigma of this one were half as large.",
         )
 
