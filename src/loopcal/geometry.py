@@ -683,9 +683,7 @@ def _find_newton_step(H: FloatArray, g: FloatArray, R: FloatArray) -> FloatArray
 
 
 def _select_distinct(R: FloatArray) -> FloatArray:
-    """Return those of the rotations (k, 3, 3) whose entries differ by more than 0.02 from all
-    earlier ones.
-    """
+    """Return the rotations (k, 3, 3) with entries more than 0.02 from all earlier ones."""
     kept: list[FloatArray] = []
     for rotation in R:
         if all(np.abs(rotation - other).max() > 0.02 for other in kept):

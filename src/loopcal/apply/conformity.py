@@ -259,9 +259,7 @@ def judge_largest_error(
 
 
 def judge_draws(draws: FloatArray, limit: float, level: float = LEVEL) -> Conformity:
-    """Compare a true error, of which draws (n,) from its distribution are given, with an upper
-    limit.
-    """
+    """Compare a true error, given as draws (n,) of its distribution, with an upper limit."""
     _check_level(level)
     low, middle, high, floor, bound = np.quantile(draws, [*INTERVAL, 1.0 - level, level]).tolist()
     probability = float((draws <= limit).mean())

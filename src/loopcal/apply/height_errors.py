@@ -97,9 +97,7 @@ class HeightErrors(DrawnResult):
     )
 
     def statistics(self, errors: str, held_out: bool) -> Statistics:
-        """Return the statistics of the sizes of "before" or "after", of the held-out or of the
-        fitted heights [m].
-        """
+        """Return the statistics "before" or "after" of the held-out or the fitted heights [m]."""
         return compute_statistics(np.abs(getattr(self, errors)[self.is_held_out == held_out]))
 
     def report_alternatives(self, count: int) -> list[Finding]:

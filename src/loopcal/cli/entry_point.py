@@ -323,9 +323,7 @@ def repeat_lost_interrupts() -> Iterator[None]:
 
 
 def describe_defect(error: BaseException, words: Sequence[str]) -> str:
-    """Save a report of an exception that is no mistake of the user, and return the sentence for the
-    screen.
-    """
+    """Save a report of an exception that is no mistake of the user; return what the user reads."""
     import platform
     import traceback
     from importlib.metadata import PackageNotFoundError, version

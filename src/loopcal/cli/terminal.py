@@ -167,9 +167,7 @@ def print_note(text: object) -> None:
 
 
 def print_finding(code: str, **facts: Any) -> None:
-    """Print the finding of a code as a note on standard error, once; a document of --json contains
-    it as well.
-    """
+    """Print the finding of a code as a note on standard error, once; --json contains it, too."""
     from loopcal.findings import report_finding
 
     finding, printed = report_finding(code, **facts), list_printed()

@@ -276,9 +276,7 @@ def score_leave_one_out(
 
 
 def _mean_square(robot: Mechanism, data: Measurements) -> float:
-    """Return the mean square of a robot's whitened residuals; infinite where it cannot reach a
-    pose.
-    """
+    """Return the mean square of whitened residuals; infinite where a pose cannot be reached."""
     problem = problem_of(select_free_parameters(robot), data)
     z = problem.free.deviation(robot.values[None])
     start = problem.start(z)

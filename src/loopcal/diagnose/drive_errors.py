@@ -80,9 +80,7 @@ def can_show_drives(linear: FitLinearization, rows: ResidualRows) -> bool:
 def measure_drive_errors(
     linear: FitLinearization, explained: ExplainedResiduals
 ) -> DriveErrors | None:
-    """Return the errors of the drives that are among the causes of the residuals of a fit; None
-    where they are not.
-    """
+    """Return the errors of the drives that cause residuals of a fit; None where none do."""
     rows, robot = explained.rows, linear.fit.robot
     causes = {c.source: c for c in explained.causes if c.source in (DRIVES, BACKLASH)}
     if rows is None or not causes:

@@ -162,9 +162,7 @@ def _estimate_larger_noise(remainder: Remainder, known: float) -> float:
 
 
 def measure_wrong_poses(remainder: Remainder, pose: IntArray, known: float) -> float:
-    """Return the evidence of few wrong poses. The pose that fits the others least is excluded, and
-    so on.
-    """
+    """Return the evidence of few wrong poses; the worst one is excluded, and so on."""
     order = np.argsort(pose, kind="stable")
     names, count = np.unique(pose, return_counts=True)
     member = np.full((len(names), int(count.max())), -1)  # rows of each pose

@@ -273,9 +273,7 @@ def report_readings_gauge(freedoms: GaugeFreedoms) -> Finding:
 
 
 def twist_weights(size: float) -> FloatArray:
-    """Return (6,) factors that make rotations [rad] comparable with displacements [m]: the robot's
-    size, and one.
-    """
+    """Return (6,) factors that turn rotations [rad] into displacements [m]: size, and one."""
     return np.array([size] * 3 + [1.0] * 3)
 
 
@@ -292,9 +290,7 @@ def observe_motions(robot: Mechanism, readings: FloatArray) -> tuple[FloatArray,
 def observe_bodies(
     robot: Mechanism, readings: FloatArray
 ) -> dict[str, tuple[FloatArray, FloatArray]]:
-    """Return the same of the bodies beside the platform: those of `bodies:` and the platforms of
-    stages, by name.
-    """
+    """Return the same of bodies beside the platform (`bodies:`, platforms of stages), by name."""
     values, q = robot.values[None], readings[None]
     state = forward_trials(robot, values, q)
     if robot.stages:

@@ -217,9 +217,7 @@ class PartialFit(NamedTuple):
         return np.where(np.isnan(p_value), 1.0, p_value)
 
     def determines_as_much(self, whole: PartialFit) -> bool:
-        """Return whether the fitted blocks determine as many directions as all blocks do, and the
-        noise.
-        """
+        """Return whether the fitted blocks determine as many directions as all, and the noise."""
         return self.directions >= whole.directions and bool(np.isfinite(self.scale))
 
 

@@ -83,9 +83,7 @@ class ResidualRows:
         return float((self.residual**2).sum())
 
     def project(self, columns: FloatArray) -> FloatArray:
-        """Return the part of columns (R, c) that nothing estimated explains; zero where that is
-        rounding.
-        """
+        """Return the part of columns (R, c) that nothing estimated explains; 0 for rounding."""
         left = columns - self.basis @ (self.basis.T @ columns)
         left -= self.basis @ (self.basis.T @ left)  # the first projection leaves rounding
         size = np.linalg.norm(columns, axis=0)

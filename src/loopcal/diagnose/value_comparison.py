@@ -158,9 +158,7 @@ class ValueComparison(DeferredFields, TableResult):
 
     @property
     def rms(self) -> float:
-        """Root mean square of the error in tolerances over the compared directions; NaN without
-        any.
-        """
+        """Root mean square of the error [tolerances] over compared directions; NaN without any."""
         if not self.compared:
             return float("nan")
         return float(np.sqrt(np.sum(self.tolerances**2) / self.compared))

@@ -39,9 +39,7 @@ from loopcal.version import __version__
 # --- Keep freed memory in the process, where the next temporary array finds it.
 
 LARGE = 3_900_000
-"""Length of an array of float64 that takes 31 MB, just below the 32 MB up to which glibc adapts its
-limits.
-"""
+"""Length of an array of float64 of 31 MB; glibc adapts its limits up to 32 MB."""
 
 
 def keep_freed_memory() -> None:

@@ -292,9 +292,7 @@ class FitAnalysis:
 
     @cached_property
     def fitted_rows(self) -> FittedRows | None:
-        """The measured rows from which the result comes; None where those of an earlier one are
-        not known.
-        """
+        """The measured rows behind the result; None where those of an earlier one are unknown."""
         is_fitted = self.robot.program.sigma is not None
         rows = collect_fitted_rows(self.data, are_readings_fitted=is_fitted)
         if (earlier := self.options.prior) is None:

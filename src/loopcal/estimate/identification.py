@@ -91,9 +91,7 @@ def exclude_poses(data: Measurements, excluded: Sequence[str]) -> Measurements:
 
 
 def check_rows(problem: Problem, data: Measurements, robot: Mechanism) -> None:
-    """Refuse readings of another robot, held-out poses, a robot without free parameters, and data
-    without any row.
-    """
+    """Refuse readings of another robot, held-out poses, no free parameters, and no rows."""
     check_actuators(data, robot)
     if count := int(data.is_held_out.sum()):
         raise DataError(report_finding("data.held-out-fitted", count=count))

@@ -62,9 +62,7 @@ class _LowestScore:
         raise NotImplementedError
 
     def __call__(self, decomposition: Decomposition) -> FloatArray:
-        """Return lam (t,): the parabola through the best grid point and its neighbors refines the
-        minimum.
-        """
+        """Return lam (t,) of the minimum of a parabola through the best point and its neighbors."""
         reference = _find_largest_square(decomposition)
         decades = np.log10(HIGHEST / LOWEST)
         grid = np.linspace(np.log10(LOWEST), np.log10(HIGHEST), int(PER_DECADE * decades) + 1)

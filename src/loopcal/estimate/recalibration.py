@@ -294,9 +294,7 @@ class ParameterChanges:
         )
 
     def project_out(self, places: list[int]) -> tuple[float, int]:
-        """Return the chi-square that is left where some parameters may have changed, and its
-        degrees of freedom.
-        """
+        """Return chi-square and its degrees of freedom where some parameters may have changed."""
         explained = self.find_span(places).T @ self.value
         left = max(self.chi_square - float(explained @ explained), 0.0)
         return left, self.degrees - len(explained)
@@ -414,9 +412,7 @@ class ChangeCause:
 
 
 def explain_change(changes: ParameterChanges, level: float) -> ChangeCause:
-    """Return the simplest cause of a change; `level` is the probability with which the true cause
-    is rejected.
-    """
+    """Return the simplest cause of a change; `level`: probability that a true one is rejected."""
     limbs = changes.group_limbs()
     kinds: dict[str, list[tuple[tuple[str, ...], list[int]]]] = {
         "parameter": [((name,), [i]) for i, name in enumerate(changes.names)],

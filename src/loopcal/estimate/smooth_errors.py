@@ -121,9 +121,7 @@ class SmoothErrors:
         return self._at_origin(T) @ (left[..., None, None] * self.amplitude)
 
     def share(self, T: FloatArray) -> FloatArray:
-        """Return the share (..,) of the variance at poses that follows from errors at the
-        centers.
-        """
+        """Return the share (..,) of the variance at poses that follows from errors at centers."""
         return np.minimum(((self._correlate(T) @ self.whitening) ** 2).sum(axis=-1), 1.0)
 
     def _correlate(self, T: FloatArray) -> FloatArray:

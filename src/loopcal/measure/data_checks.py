@@ -82,9 +82,7 @@ def check_types(robot: object, data: object) -> None:
 
 
 def check_actuators(measurements: Measurements, robot: Mechanism) -> None:
-    """Refuse other types, readings without one column per actuator, and readings alone without
-    information.
-    """
+    """Refuse other types, wrong numbers of readings, and readings alone without information."""
     check_types(robot, measurements)
     columns, names = measurements.readings.shape[1], tuple(a.name for a in robot.actuators)
     if columns != len(names):
@@ -361,9 +359,7 @@ def _find_static_targets(measurements: Measurements) -> Iterator[_StaticTarget]:
 
 
 def _group_equal_kinds(observations: tuple[Observations, ...]) -> list[list[Observations]]:
-    """Return observations in groups of one class and equal settings, as two files of one instrument
-    give them.
-    """
+    """Return observations in groups of one class and settings, as of several files."""
 
     def are_equal(kind: Kind, other: Kind) -> bool:
         names = [field.name for field in fields(kind) if field.init]

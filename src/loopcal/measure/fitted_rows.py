@@ -66,9 +66,7 @@ def _find_agreeing(rows: ComparedRows, fitted: FloatArray, is_same_form: bool) -
 
 
 def _estimate_chance(rows: ComparedRows, fitted: FloatArray, is_same_form: bool) -> FloatArray:
-    """Return the probability (r,) that the values of a repeat agree with those of its first row by
-    rounding.
-    """
+    """Return the probability (r,) that a repeat agrees with its first row by rounding."""
     other = fitted[:, rows.readings :]
     compared = np.isfinite(rows.values)
     if is_same_form:

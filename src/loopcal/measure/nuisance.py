@@ -222,9 +222,7 @@ def _list_owners(rows: Observations | Sensor, scope: str, labels: tuple[str, ...
 
 
 def _enter(entries: dict[str, Parameter], parameter: Parameter, owner: str, kind: Kind) -> str:
-    """Enter a parameter under its full name, unless it exists; refuse a different one of the same
-    name.
-    """
+    """Enter a parameter by its full name, unless it exists; refuse one that differs."""
     name = f"{owner}.{parameter.name}" if owner else parameter.name
     entry = replace(parameter, name=name)
     existing = entries.setdefault(name, entry)

@@ -200,9 +200,7 @@ def scale_sums(program: Program, weights: FloatArray, sums: FloatArray) -> engin
 def stack_sum_rows(
     program: Program, blocks: engine.ClosureBlocks, weights: FloatArray
 ) -> FloatArray:
-    """Return closure rows, then sums (t, n, c + r, M + J) against the freedoms of all nodes and the
-    driven joints.
-    """
+    """Return closure rows, then sums (t, n, c + r, M + J), by freedoms and driven joints."""
     A, Q = stack_closure_rows(blocks), stack_driven_columns(program, blocks)
     own = np.broadcast_to(weights[:, None], (*A.shape[:2], *weights.shape[1:]))
     none = np.zeros((*own.shape[:3], A.shape[3]))
@@ -213,9 +211,7 @@ def stack_sum_rows(
 def differentiate_unknowns_by_sums(
     program: Program, e: FloatArray, state: State, weights: FloatArray
 ) -> FloatArray:
-    """Return the derivatives (t, n, M + J, r) of all nodes' freedoms and of driven joints by their
-    weighted sums.
-    """
+    """Return derivatives (t, n, M + J, r) of freedoms and driven joints by their sums."""
     blocks = engine.linearize(program, e, program.list_drives(state.joints), state)
     rows = stack_sum_rows(program, blocks, weights)
     return invert_rows(rows)[..., rows.shape[2] - weights.shape[1] :]
@@ -281,9 +277,7 @@ def differentiate_open_sums(
 def differentiate_driven_joints(
     robot: Mechanism, values: FloatArray, q: FloatArray, state: State
 ) -> FloatArray:
-    """Return the derivatives (t | 1, n | 1, J, p + a) of the driven joints by all parameters in SI
-    and readings.
-    """
+    """Return the derivatives (t | 1, n | 1, J, p + a) of driven joints by all inputs [SI]."""
     if robot.has_open_sums:
         M = len(robot.program.unknown_twists)
         return _differentiate_open(robot, values, q, state)[:, :, M:]

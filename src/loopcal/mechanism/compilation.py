@@ -225,9 +225,7 @@ def _list_addresses(assembly: Assembly) -> tuple[Address, ...]:
 
 
 def _find_slots(assembly: Assembly) -> dict[str, dict[Address, Slot]]:
-    """Return the slots of the addresses that parameters change, limb by limb; refuse unknown
-    addresses.
-    """
+    """Return the slots that parameters change, limb by limb; refuse unknown addresses."""
     limbs = {limb.name: limb for limb in assembly.limbs}
     actuators, terms = {a.name for a in assembly.rows}, name_terms(assembly.rows)
     slots: dict[str, dict[Address, Slot]] = {name: {} for name in limbs}
@@ -336,9 +334,7 @@ def _group_limbs(
 def _weigh_actuators(
     assembly: Assembly, groups: tuple[Group, ...], freedoms: tuple[int, ...]
 ) -> tuple[float, ...] | None:
-    """Return relative standard deviations of redundant actuators, the largest one 1; None without
-    them.
-    """
+    """Return relative standard deviations of redundant actuators, the largest 1; else None."""
     if assembly.couplings or len(assembly.rows) <= len(freedoms):
         return None
     what = f"{len(assembly.rows)} actuators for {len(freedoms)} freedoms"

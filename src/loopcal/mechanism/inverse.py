@@ -97,9 +97,7 @@ def _close_with_free_actuators(
     start: State | None,
     max_iterations: int = ITERATIONS,
 ) -> State:
-    """Return states (t, n) at controlled coordinates, with every actuated joint free, from `start`
-    as given.
-    """
+    """Return states (t, n) at controlled coordinates, all actuated joints free, from `start`."""
     e, _ = robot.slots(values)
     names, size = robot.controlled, robot.size
     T, guess = pose_from_coordinates(target, names, robot.home), driven_values(robot.program, begin)
@@ -382,9 +380,7 @@ class _Rows:
         return replace(self, target=own[0], sign=own[1], serial=serial, **chosen_arrays)
 
     def evaluate(self, u: FloatArray, begin: tuple[State, ...]) -> _Iterate:
-        """Return the iterate at driven joints u (R, u); its gap is infinite where a loop stays
-        open.
-        """
+        """Return the iterate at driven joints u (R, u); its gap is infinite for an open loop."""
         return self.aim(self.place(u, begin))
 
     def place(self, u: FloatArray, begin: tuple[State, ...]) -> _Iterate:

@@ -77,9 +77,7 @@ def divide_limbs(
 def linearize_limbs(
     robot: Mechanism, values: FloatArray, state: State
 ) -> Iterator[tuple[tuple[slice, slice], engine.ClosureBlocks]]:
-    """Linearize all limbs at a state (t, n), block by block; yields the trials and poses of each
-    block with it.
-    """
+    """Linearize all limbs at a state (t, n); yields the trials and poses of each block with it."""
     t, n = state.T.shape[:2]
     e, _ = robot.slots(values)
     poses = max(min(n, BLOCK_ROWS), 1)

@@ -57,9 +57,7 @@ MAIN_SHARE = 0.3
 
 
 def check_mobility(robot: Mechanism) -> None:
-    """Refuse actuators that cannot move and hold the platform at home; the error names the
-    freedoms.
-    """
+    """Refuse actuators that cannot move and hold the platform at home; name its freedoms."""
     program, home = robot.program, robot.home_state
     e = robot.slots(robot.values[None])[0]
     blocks = engine.linearize(program, e, driven_values(program, home), home)
@@ -129,9 +127,7 @@ def check_mobility(robot: Mechanism) -> None:
 
 
 def refuse_free_bodies(robot: Mechanism, state: engine.State) -> None:
-    """Refuse bodies that can move while the platform rests and all actuators are locked, at a state
-    (1, 1).
-    """
+    """Refuse bodies that can move while platform and actuators rest, at a state (1, 1)."""
     program, e = robot.program, robot.slots(robot.values[None])[0]
     if not program.others:
         return
@@ -178,9 +174,7 @@ def _check_open_sums(robot: Mechanism, blocks: engine.ClosureBlocks) -> None:
 
 
 def refuse_uncontrolled(robot: Mechanism, state: engine.State) -> None:
-    """Refuse coordinates that do not determine the platform where its limbs let it move, at a state
-    (1, 1).
-    """
+    """Refuse coordinates that do not determine the motion of the platform, at a state (1, 1)."""
     program = robot.program
     e, q = robot.slots(robot.values[None])[0], driven_values(program, state)
     blocks = engine.linearize(program, e, q, state, free=True)

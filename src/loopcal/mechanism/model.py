@@ -50,9 +50,7 @@ class MovedSlots(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class ParameterUnits:
-    """Parameters at places (p,) of the table of a mechanism, each with the unit (p,) [SI] of its
-    column.
-    """
+    """Parameters at places (p,) of a table, each with the unit (p,) [SI] of its column."""
 
     slots: SlotMap
     places: IntArray

@@ -172,9 +172,7 @@ def fold_pose_rows(
 
 
 class PassiveSensitivity(NamedTuple):
-    """Derivatives of the named passive joints, (t, n, j, p) by parameters and (t, n, j, a) by
-    readings.
-    """
+    """Derivatives of named passive joints, (t, n, j, p) by parameters, (t, n, j, a) by readings."""
 
     names: tuple[str, ...]
     parameters: FloatArray

@@ -124,9 +124,7 @@ def contracts(robot: Mechanism, start: State, end: State) -> BoolArray:
 
 
 def measure_distance(robot: Mechanism, a: State, b: State) -> FloatArray:
-    """Return the largest difference (n,) of poses and joints of states (1, n | 1), lengths per
-    size.
-    """
+    """Return the largest difference (n,) of states (1, n | 1), lengths over the size."""
     largest = np.zeros(b.T.shape[1])
     for T, other in zip((a.T, *a.others), (b.T, *b.others), strict=True):
         gap = (T - other)[0]
@@ -558,9 +556,7 @@ def inverse(robot: Mechanism, target: ArrayLike, start: Solution | None = None) 
 
 
 def are_poses(robot: Mechanism, targets: ArrayLike) -> bool:
-    """Return whether targets of `inverse` are poses (.., 4, 4), and not four targets in four
-    coordinates.
-    """
+    """Return whether targets of `inverse` are poses (.., 4, 4), not four targets."""
     shape = np.shape(targets)
     if shape == (4, 4) and len(robot.controlled) == 4:
         return np.array_equal(np.asarray(targets)[3], np.eye(4)[3])

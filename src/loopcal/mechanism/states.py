@@ -48,9 +48,7 @@ def is_closed(status: np.ndarray) -> BoolArray:
 def make_start(
     T: FloatArray, joints: tuple[FloatArray, ...], others: tuple[FloatArray, ...] = ()
 ) -> State:
-    """Return the state (t, n) of platforms, joints and other nodes from which an iteration
-    starts.
-    """
+    """Return the state (t, n) of platforms, joints and other nodes where an iteration starts."""
     zero = np.zeros(T.shape[:2])
     none = zero.astype(np.int8)
     return State(T, joints, none, zero, zero.astype(np.int64), none, others)

@@ -87,9 +87,7 @@ MOVABLE = 8
 
 
 def compute_angle(length: FloatArray, triangle: FloatArray) -> FloatArray:
-    """Return the joint angle [rad] at a length (..) [m] of triangles (.., 10), NaN where none
-    reaches it.
-    """
+    """Return the joint angle [rad] at a length (..) [m] of triangles (.., 10), NaN without."""
     level, reach, gamma = describe_triangle(triangle)
     side, middle = triangle[..., 8], triangle[..., 9]
     with np.errstate(invalid="ignore"):
@@ -111,9 +109,7 @@ def compute_range(triangle: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def find_side(start: float, triangle: FloatArray) -> tuple[float, float]:
-    """Return sin(theta - gamma) at a start angle [rad], and the middle of its side [rad], of a
-    triangle.
-    """
+    """Return sin(theta - gamma) at a start angle, and the middle of its side, [rad]."""
     _, _, gamma = describe_triangle(triangle)
     lead = geometry.wrap_angle(start - gamma)
     sine = float(np.sin(lead))
@@ -631,9 +627,7 @@ def count_readings(constants: FloatArray) -> int:
 def split_readings(
     q: FloatArray, constants: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the reading, the direction of approach and the load of each row (.., a), 0 where none
-    are given.
-    """
+    """Return reading, direction of approach and load of each row (.., a), 0 without."""
     numbers = constants[:, SOURCE : LOADED + 1 : 2].astype(int)
     a, source = int(numbers.max(initial=-1)) + 1, numbers[:, 0]
     parts = q[..., :a], q[..., a:] if q.shape[-1] == 2 * a else np.zeros_like(q[..., :a])

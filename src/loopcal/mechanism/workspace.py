@@ -72,9 +72,7 @@ def evaluate_limits(
 def check_limits(
     robot: Mechanism, values: FloatArray, q: FloatArray, state: State
 ) -> tuple[BoolArray, NDArray[np.object_]]:
-    """Return which rows are within all limits (t, n), and the finding of the first exceeded one, or
-    None.
-    """
+    """Return which rows keep all limits (t, n), and the finding of the first exceeded one."""
     allowed, findings = np.ones(state.status.shape, bool), np.full(state.status.shape, None)
     for limit in evaluate_limits(robot, values, q, state):
         # a bound itself is allowed, up to the rounding of its own number
@@ -196,9 +194,7 @@ class ReachableShare(NamedTuple):
 
 
 def measure_reachable_share(robot: Mechanism, n: int, seed: int = 0) -> ReachableShare | None:
-    """Return the reachable share of the stated workspace, of n random positions; None where no
-    workspace is stated.
-    """
+    """Return the reachable share of the stated workspace, of n random poses; None without one."""
     try:
         ranges = workspace_ranges(robot)
     except MechanismError:
@@ -292,9 +288,7 @@ def draw_coordinates(
 def find_reachable(
     robot: Mechanism, coordinates: FloatArray, rejected: Counter[str]
 ) -> tuple[BoolArray, Solution]:
-    """Return which rows the machine reaches (n,), and all of them solved; count the reasons of the
-    others.
-    """
+    """Return which rows the machine reaches (n,), and all of them solved; count the reasons."""
     values, solution = robot.values[None], inverse(robot, coordinates)
     good = np.array(solution.closed)
     rejected["the loops cannot be closed"] += int((~good).sum())

@@ -110,9 +110,7 @@ class Decomposition(TrialBatch):
 
     @property
     def condition(self) -> FloatArray:
-        """(t,) largest singular value over the smallest one that counts; infinite for a matrix of
-        zeros.
-        """
+        """(t,) largest singular value over the smallest that counts; infinite for zeros."""
         s = self.singular_values
         smallest = np.where(self.used, s, np.inf).min(axis=1, initial=np.inf)
         with np.errstate(invalid="ignore"):
@@ -164,9 +162,7 @@ class Decomposition(TrialBatch):
         return np.divide(s * self.projections, total, out=np.zeros_like(s), where=total > 0.0)
 
     def remaining(self, penalty: FloatArray) -> FloatArray:
-        """Return the sum of squares (t,) that the filtered solution leaves: sum ((1 - f_i) c_i)^2 +
-        outside.
-        """
+        """Return sum ((1 - f_i) c_i)^2 + outside, (t,): what the filtered solution leaves."""
         left = (1.0 - self.filter_factors(penalty)) * self.projections
         return (left**2).sum(axis=1) + self.outside
 
@@ -220,9 +216,7 @@ class Decomposition(TrialBatch):
     def standard_deviations(
         self, penalty: FloatArray, noise: FloatArray | float = 1.0, prior: FloatArray | None = None
     ) -> FloatArray:
-        """Return the standard deviation (t, p) of each parameter by the rule of `covariance`,
-        without the matrix.
-        """
+        """Return the standard deviations (t, p) by the rule of `covariance`, without the matrix."""
         variances = self.variances(penalty, noise, prior)
         infinite = np.isinf(variances)
         finite = np.where(infinite, 0.0, variances)

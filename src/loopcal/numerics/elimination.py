@@ -396,9 +396,7 @@ class TreeElimination(TrialBatch):
 
 
 def eliminate_tree(factors: NodeFactors) -> tuple[TreeElimination, FloatArray]:
-    """Eliminate all unknowns; return also the factor (a, p + 1, p + 1) of the machine's rows that
-    are left.
-    """
+    """Eliminate all unknowns; return also the factor (a, p + 1, p + 1) of the rows left."""
     tree, arrays = factors.tree, factors.arrays()
     length = _column_lengths(factors, arrays)
     rest = empty_factor(factors.trials, factors.parameters)

@@ -310,9 +310,7 @@ class Scoring:
         return float(len(self.space)) if self.prediction is None else 1.0
 
     def scale_rows(self, rows: FloatArray) -> FloatArray:
-        """Return rows (..., r, o + p) in these coordinates, (..., r, Q); more than Q rows are
-        folded to Q.
-        """
+        """Return rows (..., r, o + p) in these coordinates, (..., r, Q); more than Q are folded."""
         scaled = rows @ self.transform
         return scaled if scaled.shape[-2] <= scaled.shape[-1] else factor_rows(scaled)
 

@@ -64,9 +64,7 @@ def find_angles(names: tuple[str, ...]) -> BoolArray:
 def interpolate_path(
     robot: Mechanism, start: FloatArray, end: FloatArray, share: float | FloatArray
 ) -> FloatArray:
-    """Return coordinates (n, c) at a share (number or (n,)) of the straight paths from start to
-    end, (n, c) each.
-    """
+    """Return coordinates (n, c) at a share (number or (n,)) of straight paths, start to end."""
     names, s = robot.controlled, np.asarray(share, dtype=float)
     angular = find_angles(names)
     step = end - start

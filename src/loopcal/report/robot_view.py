@@ -103,9 +103,7 @@ def _build_triangle_table(robot: Mechanism) -> Table:
 
 
 def _build_sum_table(robot: Mechanism) -> Table:
-    """Return what each reading is a sum of, and each coupling; no rows where each reading is a
-    joint value.
-    """
+    """Return what readings and couplings are sums of; no rows where readings are joint values."""
     sums, couplings = robot.assembly.rows, robot.assembly.couplings
     is_sum = any(row.weights not in ({}, {row.name: 1.0}) for row in sums)
     rows = [

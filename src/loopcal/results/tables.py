@@ -251,9 +251,7 @@ def format_in(unit: Unit, value: float, digits: int = 6) -> str:
 
 
 def choose_unit(unit: Unit, values: Iterable[float | None]) -> Unit:
-    """Return the unit of a column with these numbers [SI]: `unit`, or a finer one that suits the
-    largest of them.
-    """
+    """Return the unit of a column of numbers [SI]: `unit`, or a finer one for the largest."""
     sizes = [abs(x) / unit.factor_to_si for x in values if x is not None and math.isfinite(x)]
     largest = max(sizes, default=0.0)
     return UNITS[choose_symbol(largest, unit.symbol)[0]] if largest >= ROUNDING else unit

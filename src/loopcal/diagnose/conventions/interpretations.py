@@ -250,9 +250,7 @@ def _list_swaps(kind: Kind) -> Iterator[Slip]:
 
 
 def _list_orders(groups: Mapping[str, Sequence[int]], noun: str) -> Iterator[Slip]:
-    """Yield groups of columns in other orders: each two swapped, and the cyclic orders in both
-    directions.
-    """
+    """Yield groups of columns in other orders: each two swapped, and the cyclic orders."""
     names, n = tuple(groups), len(groups)
     for a, b in combinations(names, 2):
         change = permute_columns([*groups[a], *groups[b]], [*groups[b], *groups[a]])

@@ -104,9 +104,7 @@ class Comparison:
 
 
 def is_redundant(free: FreeParameters) -> bool:
-    """Return whether the robot has more actuators than freedoms, so that the readings of every pose
-    are rows, too.
-    """
+    """Return whether readings are rows, too: more actuators than freedoms."""
     return free.robot.program.sigma is not None
 
 

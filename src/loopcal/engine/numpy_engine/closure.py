@@ -29,9 +29,7 @@ from loopcal.engine.program import (
 from loopcal.typing import FloatArray
 
 CHUNK = 5120
-"""Rows computed together: few enough for the cache of a processor, many enough that Python's share
-is small.
-"""
+"""Rows computed together: few for the cache, many enough that Python's share is small."""
 
 
 def linearize(
@@ -306,9 +304,7 @@ def _select_bodies(bodies: FloatArray, numbers: Sequence[int]) -> FloatArray:
 def list_coordinates(
     program: Program, q: FloatArray, start: State, shape: tuple[int, int]
 ) -> FloatArray:
-    """Return the coordinates (12 a node + joint values, t n) of a start, the actuated joints set
-    to q.
-    """
+    """Return the coordinates (12 a node + joint values, t n) of a start, actuated joints at q."""
     count = sum(joints.shape[2] * joints.shape[3] for joints in start.joints)
     out = np.empty((12 * len(program.nodes) + count, *shape))
     for i, T in enumerate((start.T, *start.others)):

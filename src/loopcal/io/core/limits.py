@@ -59,9 +59,7 @@ class FileLimit:
     def make_error(
         self, what: str, path: str | Path, count: float | None = None, line: int | None = None
     ) -> FileError:
-        """Return the error for a file beyond this limit; `count` is None where it was not counted
-        to the end.
-        """
+        """Return the error for a file beyond this limit; `count` is None if it was not counted."""
         finding = report_finding(
             "files.limit-exceeded",
             what=what,
@@ -242,9 +240,7 @@ LIMITS = tuple(value for value in vars().values() if isinstance(value, FileLimit
 
 
 class CountLimit(NamedTuple):
-    """The largest number that an option takes; `meaning` names commands and options, for
-    documentation.
-    """
+    """The largest number that an option takes; `meaning` names commands and options."""
 
     most: int
     unit: str

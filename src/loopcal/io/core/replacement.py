@@ -268,9 +268,7 @@ def _exchange(new: Path, old: Path) -> bool:
 
 
 def list_leftovers(target: Path, state: str | None = None) -> list[Path]:
-    """Return what killed writers have left of `target` in a state (NEW, OLD, or both), oldest
-    first.
-    """
+    """Return what killed writers left of `target` in a state (NEW, OLD, or both), oldest first."""
     name = _shorten(target.name)
     leftovers = []
     with suppress(OSError), os.scandir(target.parent) as entries:
@@ -282,9 +280,7 @@ def list_leftovers(target: Path, state: str | None = None) -> list[Path]:
 
 
 def remove_leftovers(target: Path, is_own: Callable[[Path], bool]) -> None:
-    """Remove what killed writers have left of `target` and `is_own`, and return a folder set aside
-    to its name.
-    """
+    """Remove what killed writers left of `target` and `is_own`; rename back what was set aside."""
     for path in reversed(list_leftovers(target, OLD)):
         with _lock_leftover(path) as is_abandoned:
             if is_abandoned and path.is_dir() and not os.path.lexists(target):

@@ -542,9 +542,7 @@ def _read_one(
 def read_instrument(
     file: YamlFile, node: Mapping[str, Any], location: Location
 ) -> InstrumentRecord | None:
-    """Return the instrument that settings state, None where they state none; FileError for other
-    keys or values.
-    """
+    """Return the stated instrument, None where there is none; FileError for wrong content."""
     from loopcal.measure.observations import InstrumentRecord
 
     stated, place = node.get("instrument"), (*location, "instrument")

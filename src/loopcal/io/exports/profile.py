@@ -273,9 +273,7 @@ class Profile:
 
     @property
     def measured(self) -> tuple[str, ...]:
-        """The columns of the kind, of several targets each once without its target; none for
-        readings alone.
-        """
+        """The columns of the kind, each once without its target; none for readings alone."""
         names = [] if self.kind is None else [column.name for column in self.kind.columns]
         return tuple(dict.fromkeys(self.strip_target(name) for name in names))
 

@@ -243,9 +243,7 @@ class IniFile(ValueFile):
 
 
 def write_ini(source: ExportSource, into: Path | None) -> Exported:
-    """Return an INI file with corrected offsets, or entries of their own; for people what to add to
-    each offset.
-    """
+    """Return an INI file with corrected offsets, or entries; for people what to add to each."""
     get_record(source, Gough, "linuxcnc-ini", "a hexapod of the family gough")
     values, table = source.values(), source.robot.parameters
     nominal = dict(zip(table.names, table.nominal.tolist(), strict=True))

@@ -129,9 +129,7 @@ def _read_log(path: Path) -> list[list[float]]:
 
 
 def write(source: ExportSource, into: Path | None) -> Exported:
-    """Return the anchors in an existing configuration, or as lines of one; DataError for a robot
-    that has other belts.
-    """
+    """Return the anchors, in an existing configuration or alone; DataError for other belts."""
     file = MaslowConfig.parse((), Path("maslow.yaml"))
     if into is not None:
         file = MaslowConfig.load(into)

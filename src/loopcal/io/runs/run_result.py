@@ -242,9 +242,7 @@ FAULTS = (
 """What Python's and NumPy's readers raise about damaged archives, in addition to ValueError."""
 
 END = struct.Struct("<4s4H2LH")
-"""The last record of an archive: among others its signature, count of members and bytes of their
-directory.
-"""
+"""The last record of an archive, with its signature, members and bytes of the directory."""
 
 
 def read_arrays(
@@ -354,9 +352,7 @@ FORMS: Mapping[str, str] = {
     "heights_after": "finite h",
     "heights_held_out": "logical h",
 }
-"""Arrays by name: what each entry is, and the sizes of the axes; a letter is the same size in all
-arrays.
-"""
+"""Arrays by name: what each entry is, and the axes; a letter is one size in all arrays."""
 FITTED = "number rows values"
 """Form of the fitted rows of a kind, `fitted_<number>_<kind>`."""
 

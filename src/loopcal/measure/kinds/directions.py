@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bases of the kinds that measure directions: an axis of the platform from a frame, or gravity on
-the platform.
-"""
+"""Bases of the kinds that measure directions: axes in a frame, or gravity on the platform."""
 
 from __future__ import annotations
 

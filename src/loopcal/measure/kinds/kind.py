@@ -369,9 +369,7 @@ class Kind(ABC):
 
     @cached_property
     def component_columns(self) -> Mapping[tuple[str, Dimension], list[int]]:
-        """The measured components with the indices of their noise columns: x of all targets is one
-        component.
-        """
+        """The measured components with their noise columns: x of all targets is one component."""
         members: dict[tuple[str, Dimension], list[int]] = {}
         for group in self.error_groups:
             for name, column in zip(group.components, group.columns, strict=True):
@@ -679,9 +677,7 @@ class Kind(ABC):
         return columns
 
     def linearize_noise(self, measured: FloatArray) -> FloatArray:
-        """Return the derivative (..., m, m) of the residuals by errors of the noise columns, up to
-        its sign.
-        """
+        """Return the derivative (..., m, m) of residuals by errors of noise columns, up to sign."""
         m = len(self.noise_columns)
         return np.broadcast_to(np.eye(m), (*measured.shape[:-1], m, m))
 
@@ -732,7 +728,5 @@ class Kind(ABC):
         return np.concatenate([np.broadcast_to(b, (*shape, w)) for b, w in given], axis=-1)
 
     def split_columns(self, residual: FloatArray, rows: FloatArray) -> Evaluation:
-        """Return the evaluation of residuals (t, r, m) with derivatives (t, r, m, 6 + u) from
-        `join_columns`.
-        """
+        """Return residuals (t, r, m) with derivatives (t, r, m, 6 + u) from `join_columns`."""
         return Evaluation(residual, rows[..., :6], rows[..., 6:] if self.own_items else None)

@@ -135,9 +135,7 @@ class Plane(SurfaceKind):
         return height, normal, {"surface": by_surface}
 
     def _fit_surface(self, x: FloatArray, gaps: FloatArray) -> FloatArray:
-        """Return the planes of least scatter, and, where the gaps differ, the one that the gaps
-        determine.
-        """
+        """Return the planes of least scatter, and the one that unequal gaps determine."""
         middle = x.mean(axis=0)
         normals = [np.linalg.svd(x - middle, full_matrices=False)[2][2]]
         gradient = solve_least_squares(x - middle, gaps[:, 0] - gaps.mean())

@@ -73,9 +73,7 @@ class CouplingError(RecordError):
 
 
 class StrokeError(DriveError):
-    """Strokes of triangle drives that contain lengths of no angle; `strokes` has a sentence for
-    each drive.
-    """
+    """Strokes of triangle drives with lengths of no angle; `strokes` has their sentences."""
 
     def __init__(self, strokes: Mapping[str, str]) -> None:
         what = "strokes" if len(strokes) > 1 else "stroke"
@@ -332,9 +330,7 @@ Coupling = AngleCoupling | LengthCoupling
 # Drives at their joints: actuators, and their unknowns.
 
 CURVE_OF_BUILDUP = 1 / (4 * np.pi)
-"""Term `curve` per unit of build-up: radius + buildup * reading / (2 pi), integrated over the
-reading.
-"""
+"""Term `curve` per build-up: radius + buildup * reading / (2 pi), integrated."""
 
 Tolerance = LengthTolerance | AngleTolerance | RatioTolerance | None
 Term = tuple[Dimension, float, Tolerance, str, float]
@@ -471,9 +467,7 @@ class PlacedDrive:
 
 @dataclass(frozen=True, eq=False)
 class PlacedCoupling:
-    """A coupling of joints by the names of their drives; weights in m and rad. reference : of its
-    condition.
-    """
+    """A coupling of joints by their drives; weights in m and rad. reference : of its condition."""
 
     name: str
     drive: Coupling
@@ -752,9 +746,7 @@ def _word_stroke(placed: PlacedDrive) -> str:
 def refuse_idle_drives(
     stated: Iterable[str], used: Iterable[str], groups: Iterable[str] = ()
 ) -> None:
-    """Refuse a stated drive that is none of those used, nor a name of several; raises
-    RecordError.
-    """
+    """Refuse a stated drive that is none of those used, nor a name of several (RecordError)."""
     used, known = tuple(used), {*used, *groups}
     for name in stated:
         if name not in known:
@@ -817,9 +809,7 @@ def _check_table(placed: PlacedDrive) -> None:
 
 
 def drive_errors(placed: PlacedDrive) -> ErrorModel:
-    """Return the unknown terms of a drive, `q1.offset` and so on; raises MechanismError for
-    impossible ones.
-    """
+    """Return the unknown terms of a drive, `q1.offset` and so on; refuse impossible ones."""
     drive, name, known = placed.drive, placed.own.name, placed.list_terms()
     errors = [weight_errors(name, drive, placed.weights, tuple(known))]
     if isinstance(drive, TriangleDrive):
@@ -852,9 +842,7 @@ def _term_error(placed: PlacedDrive, term: str) -> ErrorModel:
 
 
 def check_motion(name: str, drive: Drive, turns: bool) -> None:
-    """Refuse a drive whose transmission does not give what its joint does; raises
-    MechanismError.
-    """
+    """Refuse a drive whose transmission does not give what its joint does (MechanismError)."""
     if turns == isinstance(drive, AngleDrive | TriangleDrive):
         return
     motion, allowed = (
@@ -868,9 +856,7 @@ def check_motion(name: str, drive: Drive, turns: bool) -> None:
 def complete_drives(
     drives: Mapping[str, PlacedDrive], couplings: Iterable[PlacedCoupling], spread: ErrorTolerances
 ) -> ErrorModel:
-    """Return the offset of every drive and coupling and the dimensions of triangles as
-    parameters.
-    """
+    """Return the offsets of drives and couplings and dimensions of triangles as parameters."""
     errors = [
         offset_error(f"{c.name}.offset", c.name, d, c.drive.offset, spread.select(d))
         for c in couplings
@@ -1112,9 +1098,7 @@ def is_weight(weights: Mapping[str, float], term: str) -> bool:
 def weight_errors(
     name: str, drive: object, weights: Mapping[str, float], other: tuple[str, ...]
 ) -> ErrorModel:
-    """Return the unknown weights of a sum, `q1.weight.m` and so on; `other` are the other terms of
-    the drive.
-    """
+    """Return the unknown weights of a sum, `q1.weight.m` ..; `other` are its other terms."""
     unknown: tuple[str, ...] = getattr(drive, "unknown", ())
     tolerance: RatioTolerance | None = getattr(drive, "weights", None)
     joints: list[str] = []

@@ -212,9 +212,7 @@ class Gough(RobotRecord):
     tolerances: GoughTolerances = field(default_factory=GoughTolerances)
 
     def expand(self) -> Assembly:
-        """Return six legs in the stated form; raises MechanismError for a model that it cannot
-        carry.
-        """
+        """Return six legs in the stated form; MechanismError for a model that it cannot carry."""
         self._check()
         legs, own, errors = list[PlacedLimb](), list[Actuator](), ErrorModel()
         for i, length in enumerate(values_per_leg(self.lengths, 6, "lengths")):

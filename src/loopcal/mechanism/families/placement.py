@@ -154,9 +154,7 @@ def place_limb_with_ball(
 
 
 def frame_from_axis(axis: FloatArray, owner: str) -> FloatArray:
-    """Return a rotation (3, 3) whose third column is along `axis`; x, y and z give a cyclic
-    permutation.
-    """
+    """Return a rotation (3, 3) whose third column is along `axis`; x, y, z permute the axes."""
     length = float(np.linalg.norm(axis))
     if not length > 0:
         raise MechanismError(f"{owner} has the axis [0, 0, 0]. Give a direction")
@@ -179,9 +177,7 @@ def map_displacement(
 def map_direction(
     parameter: str, limb: PlacedLimb, element: str, direction: FloatArray, *, turns: bool
 ) -> tuple[LinearMap, ...]:
-    """Map a parameter onto a rotation about (or translation along) `direction` (3,) of the carried
-    frame.
-    """
+    """Map a parameter onto a rotation about (or shift along) `direction` of the carried frame."""
     components = limb.rotations[element].T @ direction
     axes = AXES[:3] if turns else AXES[3:]
     # what is below rounding of a direction is no component
@@ -453,9 +449,7 @@ class RatioTolerance:
 def standard_deviation(
     tolerance: LengthTolerance | AngleTolerance | RatioTolerance | None, name: str
 ) -> float | None:
-    """Return the standard deviation of a tolerance [SI], None if none is stated; raises
-    MechanismError.
-    """
+    """Return the standard deviation of a tolerance [SI], None without; or MechanismError."""
     if tolerance is None:
         return None
     if (tolerance.sd is None) == (tolerance.limits is None):

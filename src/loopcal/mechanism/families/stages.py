@@ -76,9 +76,7 @@ class StageError(RecordError):
 
 
 def check_stage_names(names: Sequence[str], parents: Sequence[str | None]) -> list[str]:
-    """Return what each stage is attached to: BASE, or an earlier stage; None stands for the
-    previous one.
-    """
+    """Return what each stage is on: BASE, or an earlier stage; None stands for the previous one."""
     if not names:
         raise StageError(
             ("there are no stages. List the coordinates of the chain, from the base on"), 0

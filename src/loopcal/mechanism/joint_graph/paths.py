@@ -648,9 +648,7 @@ def _refuse_repeated(joints: Sequence[GraphJoint]) -> None:
 
 
 def _merge_pins(base: str, joints: list[GraphJoint]) -> tuple[GraphJoint, ...]:
-    """Return the joints, in which two about one axis that hold a body without other joints are one
-    pin.
-    """
+    """Return the joints, in which two about one axis with nothing between them are one pin."""
     for body in dict.fromkeys(name for j in joints for name in j.bodies):
         ends = [joint for joint in joints if body in joint.bodies]
         if body == base or len(ends) != 2 or not _are_coaxial(body, *ends):

@@ -141,9 +141,7 @@ def list_replaced(results: Results) -> tuple[str, ...]:
 
 
 def compare_tables(results: Results) -> tuple[published.Comparison, ...]:
-    """Return the stated counts and reductions of figure 5 beside the computed ones; nothing for
-    another robot.
-    """
+    """Return the stated numbers of figure 5 beside computed ones; nothing for other robots."""
     if results.case.robot is not None:
         return ()
     counts = published.Printed.parse({

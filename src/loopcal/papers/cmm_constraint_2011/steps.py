@@ -191,9 +191,7 @@ class Study:
         return both[0], both[1]
 
     def solve(self, values: FloatArray) -> FloatArray:
-        """Return the held-out poses of the tool (t, n, 4, 4) of machines (t, p) at the nominal
-        readings.
-        """
+        """Return held-out tool poses (t, n, 4, 4) of machines (t, p) at the nominal readings."""
         T = forward_trials(self.robot, values, self.held_out.q[None], self.held_out.state).T
         return T @ self.robot.tool
 
@@ -337,16 +335,12 @@ class Cell:
         return (self.iterations <= most) & self.converged[LS]
 
     def compute_median(self, method: str, measure: str, is_lost: bool = False) -> float:
-        """Return the median over the machines on which the method converged, or did not; NaN
-        without any.
-        """
+        """Return the median over machines whose fit converged, or did not; NaN without any."""
         errors = self.errors[method][measure][self.converged[method] != is_lost]
         return float(np.median(errors)) if len(errors) else np.nan
 
     def compute_left(self, method: str, measure: str) -> FloatArray:
-        """Return the part (t,) of the error of each machine that is left; NaN where the method did
-        not converge.
-        """
+        """Return the part (t,) of the error that is left; NaN where the method did not converge."""
         left = self.errors[method][measure] / self.errors[BEFORE][measure]
         return np.where(self.converged[method], left, np.nan)
 

@@ -135,9 +135,7 @@ def _compare_table_4(setup: Setup) -> published.Comparison:
 
 
 def list_replaced(results: Results) -> tuple[str, ...]:
-    """Return sentences on the rule that another one replaces, and on what belongs to the robot of
-    the paper alone.
-    """
+    """Return sentences on a rule that is replaced, and on what belongs to the paper's robot."""
     setup, printed = results.setup, PRINTED.number("threshold", "value")
     data = {"epsilon": setup.epsilon, "printed": printed, "robot": setup.robot.name,
             "noise": PRINTED.number("noise", "value")}  # fmt: skip

@@ -200,9 +200,7 @@ def make_instrument(length: float, angle: float) -> levels.InstrumentLevel:
 
 
 def list_noises() -> dict[str, tuple[float, float]]:
-    """Return the limits [mm, rad] of the noises of sizes.yaml, which are multiples of the printed
-    one.
-    """
+    """Return the limits [mm, rad] of the noises of sizes.yaml, multiples of the printed one."""
     printed = PRINTED.number("noise", "value")
     return {
         name: (float(f"{share * printed:.6g}"), float(f"{share * printed * angle:.6g}"))

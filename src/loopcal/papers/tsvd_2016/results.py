@@ -73,9 +73,7 @@ Place = TypeVar("Place")
 
 
 Draws = tuple[Sweep, ...]
-"""The machines of a manipulator: with all measured coordinates and, where there is one, without
-psi.
-"""
+"""Machines of a manipulator: with all measured coordinates and, if possible, without psi."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -567,9 +565,7 @@ def _compare_with_before(sweep: Sweep, errors: FloatArray) -> FloatArray:
 
 
 def _compare_exact(draws: Draws) -> Held:
-    """Return whether exact 5-DOF measurements lead to the true parameters, where exact 6-DOF ones
-    do.
-    """
+    """Return whether exact 5-DOF measurements lead to the truth, where exact 6-DOF ones do."""
     study, left = draws[1].study, draws[1].exact.max(axis=0)
     limit = SIZES.find("reached") * study.before[:, 3]
     six, five = (sweep.exact[:, 3] for sweep in draws)

@@ -164,9 +164,7 @@ def load_design(name: str) -> Design:
 
 
 def adapt_design(case: StudyCase) -> Design:
-    """Return another robot with the poses and errors of its study file; DataError where it has no
-    errors to identify.
-    """
+    """Return another robot with poses and errors of its study file; DataError without errors."""
     study, robot = case.load_study(), case.robot
     assert robot is not None
     content = describe_cell(study, study.cells[0])

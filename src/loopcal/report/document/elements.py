@@ -241,9 +241,7 @@ class CalibrationRecord:
 
     @property
     def fitted_labels(self) -> tuple[str, ...]:
-        """Labels of the fitted poses, without those that options excluded; none where an older
-        version wrote the run.
-        """
+        """Labels of fitted poses, without excluded ones; none for runs of older versions."""
         labels = self.arrays.get("poses")
         excluded = self.result["fit"].get("dropped") or ()
         return () if labels is None else tuple(n for n in labels.tolist() if n not in excluded)

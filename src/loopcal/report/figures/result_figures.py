@@ -313,9 +313,7 @@ def draw_validation(validation: Validation) -> Figure:
 
 
 def _draw_decision(axes: Axes, quantity: str, conformity: Conformity, unit: Unit) -> None:
-    """Draw the largest error with its interval on a number line, between what is accepted and what
-    is rejected.
-    """
+    """Draw the largest error with its interval on a line from accepted to rejected."""
     unit = choose_unit(unit, [conformity.estimate])
     ends = ("low", "estimate", "high", "limit", "acceptance_limit", "rejection_limit")
     low, error, high, limit, accepted, rejected = (

@@ -266,9 +266,7 @@ def check_levels(study: Study, robots: Sequence[Mechanism], content: StudyConten
 
 
 def _check_surfaces(level: PosesLevel, study: Study, robots: Sequence[Mechanism]) -> None:
-    """Raise LoopcalError where points on planes and lines do not fit robots, instruments or
-    effects.
-    """
+    """Raise LoopcalError where points on surfaces do not fit robots, instruments or effects."""
     if level.is_on_surfaces:
         for robot in robots:
             make_groups(robot, level)

@@ -91,9 +91,7 @@ class Answer:
 
 @dataclass(frozen=True)
 class AnsweredQuestion:
-    """A question with its answers. `name` : in the study file. `limit` : in SI. `score_unit` : its
-    unit.
-    """
+    """A question with its answers; `name` in the study file, `limit` in SI, unit of the score."""
 
     name: str
     question: Question
@@ -236,9 +234,7 @@ def view_answers(answered: Sequence[AnsweredQuestion]) -> list[Block]:
 
 
 def tabulate_answers(answered: AnsweredQuestion) -> Table:
-    """Return a row for each combination of the other factors: the answer, and the shares that
-    decide it.
-    """
+    """Return a row for each combination of other factors: the answer, and shares behind it."""
     answers, asked = answered.answers, answered.question
     columns = {factor: [a.levels[factor] for a in answers] for factor in answers[0].levels}
     if any(answer.chain for answer in answers):
@@ -267,9 +263,7 @@ def say_answer(answer: Answer, wanted: str) -> str:
 
 
 def say_deciding_shares(answer: Answer) -> str:
-    """Return the shares of the candidates, and of the levels beside them; of all where there are
-    no candidates.
-    """
+    """Return shares of candidates and of levels beside them; of all without candidates."""
     chosen = {share.level for share in answer.shares if share.level in answer.candidates}
     for level, next_level in pairwise(share.level for share in answer.shares):
         if (level in answer.candidates) != (next_level in answer.candidates):
@@ -342,9 +336,7 @@ def view_summary(study: Study, summary: StudySummary, shown: Sequence[str]) -> l
 
 
 def explain_failures(counts: Mapping[str, int], trials: int) -> list[Block]:
-    """Return a line for each code of failed or unfinished trials (code -> trials): what it means,
-    what to do.
-    """
+    """Return a line for each code of trials (code -> trials): what it means, what to do."""
     unfinished = {OUTCOMES[STEPS_REMAIN]: "Trials at their limit of steps"}
     return [
         f"{unfinished.get(code, 'Failed trials')}: {count} of {trials}. {report_finding(code)} "

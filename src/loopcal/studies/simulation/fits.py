@@ -324,9 +324,7 @@ def fit_each(cell: PreparedCell, trials: Trials) -> FittedTrials:
 
 
 def state_times(data: Measurements) -> Measurements:
-    """Return measurements with the time of each row, as instruments record it: the tests for slow
-    errors need it.
-    """
+    """Return measurements with the time of each row, for the tests of slow errors."""
     first = [rows.rows.reshape(len(rows), -1)[:, 0] for rows in data.observations]
     observations = tuple(
         replace(rows, context={"time": POSE_TIME * poses})

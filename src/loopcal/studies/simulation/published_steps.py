@@ -649,9 +649,7 @@ class PaperRows:
 
     @cached_property
     def whitener(self) -> FloatArray:
-        """(g, k - 2, k - 2) what the rows of a group are multiplied by; made at the points as
-        commanded.
-        """
+        """(g, k - 2, k - 2) multiplies the rows of a group; made at the points as commanded."""
         return build_whitener(*self.layout.levers, self.sigma, self.weights)
 
     def values(self, deviation: FloatArray) -> FloatArray:

@@ -278,9 +278,7 @@ class Study(StudySettings, Result):
 
     @cached_property
     def levels(self) -> dict[str, Mapping[str, Any]]:
-        """Name of each factor -> its levels by their names: factors of the file in its order, then
-        the others.
-        """
+        """Factor -> its levels by name: factors of the file in its order, then the others."""
         levels = {name: getattr(self, key) for key, name in FACTORS.items()}
         return {name: levels[name] for name in dict.fromkeys((*self.order, *levels))}
 

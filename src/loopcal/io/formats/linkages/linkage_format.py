@@ -65,9 +65,7 @@ PLACED = 1e-9
 def make_format(
     what: str, about: str, endings: tuple[str, ...], read_tree: Callable[[Path], LinkTree]
 ) -> Format:
-    """Return the format of files of links and joints that `read_tree` reads; `what` is one of them,
-    such as "an SDF".
-    """
+    """Return the format of files that `read_tree` reads; `what` is one of them: "an SDF"."""
     name = what.rsplit(maxsplit=1)[-1]
 
     def read_file(path: Path, options: ImportOptions) -> Imported:

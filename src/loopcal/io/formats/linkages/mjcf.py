@@ -288,9 +288,7 @@ def read_tree(path: Path) -> LinkTree:
 
 
 def _choose_root(reader: _Reader) -> str:
-    """Return the body that stands for the base: the world, or the only free body, if nothing else
-    moves.
-    """
+    """Return the base: the world, or the only free body, if nothing else moves."""
     moving = {joint.parent for joint in reader.joints if joint.kind}
     free = reader.floating
     on_world = any(_find_top(reader, body) not in free for body in moving if body in reader.bodies)
@@ -326,9 +324,7 @@ class Closure:
 
 
 def _read_closures(reader: _Reader, links: Mapping[str, None]) -> list[Closure]:
-    """Return the closures between bodies of the mechanism; two points of the same bodies are a
-    hinge.
-    """
+    """Return the closures of the mechanism; two points of the same bodies are a hinge."""
     closures: list[Closure] = []
     for i, part in enumerate(reader.equalities):
         closure = _read_closure(reader, part, i, links)
@@ -508,9 +504,7 @@ def _write_joint(
     T_joint: FloatArray,
     body: str,
 ) -> Iterator[Edit]:
-    """Yield the edits of a joint that is drawn elsewhere in its body; both places (4, 4) are in the
-    root.
-    """
+    """Yield the edits of a joint drawn elsewhere in its body; places (4, 4) are in the root."""
     assert joint.element is not None
     drawn = draw_links(tree)
     old = geometry.invert_pose(drawn[body]) @ drawn[joint.child]

@@ -259,9 +259,7 @@ def _span(
 
 
 def _carry(joint: SdfJoint, drawn: Mapping[str, FloatArray]) -> tuple[TreeJoint, ...]:
-    """Return the joint that carries a link; a fixed one joins the link where it has another frame
-    than the joint.
-    """
+    """Return the joint that carries a link, and a fixed one where their frames differ."""
     is_moved = bool(joint.kind) and np.abs(joint.T_child - np.eye(4)).max() > 0
     T_child = joint.T_child if is_moved else np.eye(4)
     T_parent = derive_end(drawn, joint.parent, joint.child, T_child)
@@ -315,9 +313,7 @@ def _read_mimic(mimic: Element) -> tuple[str, float, float]:
 
 
 def rewrite(tree: LinkTree, other: LinkTree) -> str:
-    """Return the text with the poses of links, and of the joints that close loops, of another
-    tree.
-    """
+    """Return the text with poses of links, and of joints that close loops, of another tree."""
     root = parse_xml(tree.text, tree.path, WHAT)
     model = next(element for element in root.walk() if element.name == "model")
     before = Frames(_find_elements(model), {})

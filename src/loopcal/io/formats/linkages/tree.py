@@ -154,9 +154,7 @@ def build_tree(
     rewrite: Callable[[LinkTree, LinkTree], str],
     what: str,
 ) -> LinkTree:
-    """Return the tree of links and joints; FileError where names repeat, or they are not one
-    tree.
-    """
+    """Return the tree of links and joints; FileError for repeated names, or no single tree."""
     named: dict[str, dict[str, int]] = {"joint": {}, "constraint": {}}
     for sort, entry in (*(("joint", j) for j in joints), *(("constraint", c) for c in constraints)):
         if entry.name in named[sort]:
@@ -225,7 +223,5 @@ def draw_links(tree: LinkTree) -> dict[str, FloatArray]:
 
 
 def derive_end(drawn: Mapping[str, FloatArray], link: str, other: str, T: FloatArray) -> FloatArray:
-    """Return the frame of a link that is, in the drawn pose, where the frame T (4, 4) of another
-    one is.
-    """
+    """Return the frame of a link that is drawn where the frame T (4, 4) of another one is."""
     return geometry.invert_pose(drawn[link]) @ drawn[other] @ T

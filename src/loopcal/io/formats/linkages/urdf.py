@@ -79,9 +79,7 @@ def parse(text: str, path: Path) -> LinkTree:
 
 
 def _refuse_elements(root: Element) -> None:
-    """Refuse elements whose neglect would give another machine, and names with invisible
-    characters.
-    """
+    """Refuse elements that would give another machine if ignored, and invisible characters."""
     depths = [(root, 1), *((a, 2) for a in root.children)]
     depths += [(b, 3) for a in root.children for b in a.children]
     for element, depth in depths:
