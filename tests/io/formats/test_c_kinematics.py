@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The exported C file computes what loopcal does: its test compares 50 poses and derivatives."""
 
+import ctypes
+import re
 import shutil
 import subprocess
 from pathlib import Path
@@ -10,7 +12,7 @@ import pytest
 
 import loopcal as lc
 from loopcal.cli.entry_point import main
-from loopcal.io.formats.c_kinematics import write
+from loopcal.io.formats.c_kinematics import fill_template, list_movable, write
 from loopcal.io.formats.program_format import ExportSource
 from tests.robot_texts import load_text
 from tests.zoo import ROBOTS
@@ -142,3 +144,73 @@ def test_more_drives_than_freedoms_agree_or_are_refused(tmp_path: Path) -> None:
     assert "0 failed" in compile_and_run(export_text(robot), tmp_path)
     with pytest.raises(lc.LoopcalError, match="more drives than freedoms"):
         export_text(load_text(tmp_path, FOUR_ARMS.replace("ELBOW", ELBOW)))
+
+
+class Library:
+    """The compiled functions of a C file; `state` is the home pose at first."""
+
+    def __init__(self, text: str, folder: Path) -> None:
+        (folder / "kinematics.c").write_text(text, "utf-8")
+        command = ["gcc", *FLAGS, "-shared", "-fPIC", "-O1", "kinematics.c", "-o", "kinematics.so"]
+        subprocess.run([*command, "-lm"], cwd=folder, check=True)
+        self.functions = ctypes.CDLL(str(folder / "kinematics.so"))
+        self.state = ctypes.create_string_buffer(100_000)
+        self.functions.kinematics_home(self.state)
+
+    def call(self, name: str, given: np.ndarray, size: int) -> tuple[int, np.ndarray]:
+        """Return the status and the `size` numbers that a function gives, NaN where it fails."""
+        numbers, out = np.ascontiguousarray(given, float), np.full(size, np.nan)
+        pointers = [array.ctypes.data_as(ctypes.c_void_p) for array in (numbers, out)]
+        function = getattr(self.functions, f"kinematics_{name}")
+        return function(pointers[0], self.state, pointers[1]), out
+
+    def set_parameters(self, values: np.ndarray) -> None:
+        numbers = np.ascontiguousarray(values, float)
+        self.functions.kinematics_set_parameters(numbers.ctypes.data_as(ctypes.c_void_p))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["arm-6r", "3-prs", "core-xy", "par4", "pentapod", "excavator"])
+def test_parameters_can_change_without_compiling(name: str, tmp_path: Path) -> None:
+    robot = lc.load_robot(name)
+    places = list_movable(robot)
+    library = Library(fill_template(robot, places), tmp_path)
+    values, own = robot.values.copy(), draw_machine(robot).values
+    values[places] = own[places]
+    sample = lc.sample_workspace(robot.with_values(values), 10, 1)
+    library.set_parameters(values[places])
+    for q, pose in zip(sample.solution.q, sample.solution.T, strict=True):
+        status, reached = library.call("forward", q, 12)
+        assert status == 0
+        assert np.abs(reached[:9] - pose[:3, :3].ravel()).max() < 1e-12
+        assert np.abs(reached[9:] - pose[:3, 3]).max() < 1e-12 * max(1.0, robot.size)
+
+
+def test_a_file_whose_parameters_move_no_link_compiles(tmp_path: Path) -> None:
+    robot = lc.load_robot("core-xy")
+    gain = robot.parameters.names.index("z.gain")
+    library = Library(fill_template(robot, [gain]), tmp_path)
+    library.set_parameters(np.array([1.5]))
+    home = lc.inverse(robot, robot.home[None]).q[0]
+    assert abs(library.call("forward", home, 12)[1][11] - 0.15) < 1e-12
+
+
+def test_a_robot_without_a_workspace_is_tested_around_home(tmp_path: Path) -> None:
+    text = (Path(lc.__file__).parent / "robots" / "five-bar.yaml").read_text("utf-8")
+    robot = load_text(tmp_path, re.sub(r"^workspace:.*\n( .*\n)*", "", text, flags=re.M))
+    with pytest.raises(lc.MechanismError, match="no workspace"):
+        lc.sample_workspace(robot, 1)
+    assert compile_and_run(export_text(robot), tmp_path).startswith("50 poses, 0 failed")
+
+
+def test_a_pose_that_no_reading_gives_has_a_status(tmp_path: Path) -> None:
+    """The screw turns back before its leg is as long as the pose needs."""
+    shipped = (Path(lc.__file__).parent / "robots" / "hexapod-42.yaml").read_text("utf-8")
+    robot = load_text(tmp_path, shipped + "drives: {q1: {reads: length, curve: -20}}\n")
+    library = Library(export_text(robot), tmp_path)
+    before = library.state.raw
+    for height, expected in ((0.4, 1), (0.23, 0)):
+        assert before == library.state.raw
+        status, q = library.call("inverse", np.array([0, 0, height, 0, 0, 0]), 6)
+        assert status == expected
+        assert np.isfinite(q).all() == (expected == 0)

@@ -9,6 +9,7 @@ Derivation: docs/theory/kinematics.md.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from importlib.resources import files
 from pathlib import Path
@@ -18,14 +19,14 @@ import numpy as np
 
 from loopcal.engine.numpy_engine.closure import place_links
 from loopcal.engine.program import BASE, LENGTH, PITCH
-from loopcal.errors import DataError
+from loopcal.errors import DataError, MechanismError
 from loopcal.findings import report_finding
 from loopcal.io.formats.program_format import Exported, ExportSource, Format
 from loopcal.mechanism.chains import list_carrying_stages
 from loopcal.mechanism.inverse import determine_platform, measure_spans, moves_by_drives
 from loopcal.mechanism.model import Mechanism, Stage
-from loopcal.mechanism.platform_coordinates import EULER, POSITION, TILT
-from loopcal.mechanism.solutions import jacobian
+from loopcal.mechanism.platform_coordinates import EULER, POSITION, TILT, read_coordinates
+from loopcal.mechanism.solutions import Solution, jacobian
 from loopcal.mechanism.transmission import (
     ALL_TERMS,
     FIXED,
@@ -40,7 +41,7 @@ from loopcal.mechanism.transmission import (
     select_table,
     select_weights,
 )
-from loopcal.mechanism.workspace import sample_workspace
+from loopcal.mechanism.workspace import find_reachable, sample_workspace
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import SI_SYMBOLS
 from loopcal.version import __version__
@@ -54,6 +55,8 @@ MOVABLE = ("double LINK", "struct limb", "double PITCH", "struct transmission")
 """Tables that are not constant in a file with parameters."""
 TESTS, SEED = 50, 0
 """Poses of the test table, and the seed that draws them from the workspace."""
+NEAR = 0.02
+"""Largest distance from home of poses of a robot without a workspace: of its size, and [rad]."""
 AGREEMENT = 1e-12
 """Largest difference of poses [m, 1] that the test in the file accepts, for a robot of a meter or
 less: it is the rounding of some hundred operations, times the amplification of the mechanism."""
@@ -421,18 +424,38 @@ def _add_transmissions(
         tables.weights.append((drives, own))
 
 
+def _draw_poses(robot: Mechanism) -> tuple[FloatArray, Solution]:
+    """Return coordinates (n, c) of the workspace, and their solution; where it is not stated or not
+    reached those of home and of what is reached around it.
+
+    MechanismError : not even home is reached.
+    """
+    try:
+        sample = sample_workspace(robot, TESTS, SEED)
+        return sample.coordinates, sample.solution
+    except MechanismError as error:
+        is_length = np.isin(robot.controlled, POSITION)
+        span = np.where(is_length, NEAR * robot.size, NEAR)
+        home = read_coordinates(robot.home_state.T[0, :1], robot.controlled)
+        shares = np.random.default_rng(SEED).uniform(-1.0, 1.0, (TESTS, home.shape[1]))
+        shares[0] = 0.0
+        near = home + span * shares
+        good, solution = find_reachable(robot, near, Counter())
+        if not good.any():
+            raise error
+        return near[good], solution.take(good)
+
+
 def _write_tests(robot: Mechanism, commanded: BoolArray) -> str:
-    """Return poses within the workspace with their coordinates, readings and derivatives."""
-    coordinates = sample_workspace(robot, TESTS, SEED)
-    slopes = jacobian(robot, coordinates.solution.q, coordinates.solution)
+    """Return poses with their coordinates, readings and derivatives."""
+    coordinates, solution = _draw_poses(robot)
+    slopes = jacobian(robot, solution.q, solution)
     poses = slopes.solution.T
     parts = [
         f"#define TESTS {len(poses)}",
         f"#define AGREEMENT {_write(AGREEMENT * max(1.0, robot.size))}",
-        _table("double TEST_COORDINATES[TESTS][KINEMATICS_COORDINATES]", coordinates.coordinates),
-        _table(
-            "double TEST_READINGS[TESTS][KINEMATICS_READINGS]", coordinates.solution.q[:, commanded]
-        ),
+        _table("double TEST_COORDINATES[TESTS][KINEMATICS_COORDINATES]", coordinates),
+        _table("double TEST_READINGS[TESTS][KINEMATICS_READINGS]", solution.q[:, commanded]),
         _table("double TEST_POSES[TESTS][12]", map(_flatten, poses)),
         _table(
             "double TEST_SLOPES[TESTS][6][KINEMATICS_READINGS]", slopes.readings[..., commanded]

@@ -9,7 +9,7 @@
 
 enum {
     KINEMATICS_OK,
-    KINEMATICS_UNREACHABLE, /* no closed loops were found near the state */
+    KINEMATICS_UNREACHABLE, /* no closed loops were found near the state, or no readings for them */
     KINEMATICS_OTHER_MODE,  /* the loops close on the other side of a singularity */
     KINEMATICS_SINGULAR     /* at a singularity, or an input is not a number */
 };
@@ -211,7 +211,7 @@ static double *find_number(const struct moved_number *m)
 
 void kinematics_set_parameters(const double values[KINEMATICS_PARAMETERS])
 {
-    double move[MOVED_LINKS][6], twist[6], change;
+    double move[MOVED_LINKS + 1][6], twist[6], change; /* C has no empty arrays */
     int i, k;
     for (i = 0; i < MOVED_LINKS; i++)
         for (k = 0; k < 6; k++)
@@ -287,11 +287,11 @@ static double read_sum(int i, const double *readings)
     return value;
 }
 
-/* Return the reading i that gives a sum, by Newton's method from `begin`. */
+/* Return the reading i that gives a sum, by Newton's method from `begin`; NaN where none does. */
 static double find_reading(int i, double sum, double begin)
 {
     const struct transmission *t = &TRANSMISSION[i];
-    double r = begin, slope, step;
+    double r = begin, slope, step = 0.0;
     int k;
 #if TRIANGLES
     if (t->triangle.reach > 0.0)
@@ -305,7 +305,7 @@ static double find_reading(int i, double sum, double begin)
         if (fabs(step) <= 1e-15 * (1.0 + fabs(r)))
             break;
     }
-    return r;
+    return fabs(step) <= 1e-9 * (1.0 + fabs(r)) ? r : NAN;
 }
 
 /* --- Equations. */
@@ -979,7 +979,7 @@ int kinematics_forward(const double readings[KINEMATICS_READINGS], kinematics_st
 int kinematics_inverse(const double coordinates[KINEMATICS_COORDINATES], kinematics_state *s,
                        double readings[KINEMATICS_READINGS])
 {
-    double sums[SUMS], begin[KINEMATICS_COORDINATES];
+    double sums[SUMS], begin[KINEMATICS_COORDINATES], found[KINEMATICS_READINGS] = {0};
     kinematics_state now = *s;
     int i, n, status, turns[KINEMATICS_COORDINATES];
     for (n = 0; n < KINEMATICS_COORDINATES; n++) {
@@ -993,8 +993,14 @@ int kinematics_inverse(const double coordinates[KINEMATICS_COORDINATES], kinemat
         return status;
     read_state(&now, sums, begin);
     for (i = 0; i < SUMS; i++)
-        if (TRANSMISSION[i].reading >= 0)
-            readings[TRANSMISSION[i].reading] = find_reading(i, sums[i], TRANSMISSION[i].begin);
+        if (TRANSMISSION[i].reading >= 0) {
+            double reading = find_reading(i, sums[i], TRANSMISSION[i].begin);
+            if (!(fabs(reading) < HUGE_VAL))
+                return KINEMATICS_UNREACHABLE;
+            found[TRANSMISSION[i].reading] = reading;
+        }
+    for (i = 0; i < KINEMATICS_READINGS; i++)
+        readings[i] = found[i];
     *s = now;
     return status;
 }

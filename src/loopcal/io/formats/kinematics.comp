@@ -1,4 +1,4 @@
-component {name} "Kinematics of {robot}, identified by loopcal";
+component {name} {title};
 description """
 Install it:
 .nf
@@ -15,11 +15,11 @@ In a HAL file, to change a parameter without compiling:
 """;
 license "Apache-2.0";
 option singleton yes;
+include "kinematics.h";
 {pins}
 ;;
 #define KINEMATICS_WORK static /* real-time threads have small stacks */
 {code}
-#include "kinematics.h"
 
 static const double JOINT_UNIT[KINEMATICS_READINGS] = {joint_units};
 static const double AXIS_UNIT[KINEMATICS_COORDINATES] = {axis_units};

@@ -10,6 +10,8 @@ whose effect is linear is a pin. Source: the documentation of halcompile and of 
 
 from __future__ import annotations
 
+import re
+from collections.abc import Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
 
@@ -21,10 +23,12 @@ from loopcal.io.formats.c_kinematics import fill_template, list_movable
 from loopcal.io.formats.program_format import Exported, ExportSource, Format
 from loopcal.mechanism.kinematics import compute_readings
 from loopcal.mechanism.model import Mechanism
-from loopcal.units import UNITS, Dimension
+from loopcal.units import UNITS, Dimension, Unit
 
 NAME = "loopcalkins"
 """Name of the component, which its file must have."""
+LONGEST = 47 - len(f"{NAME}.")
+"""Characters of the name of a pin, of which HAL allows 47 with the component's name."""
 AXES = {"x": "tran.x", "y": "tran.y", "z": "tran.z", "roll": "a", "pitch": "b", "yaw": "c"}
 """Coordinate -> member of LinuxCNC's pose."""
 
@@ -45,13 +49,16 @@ def write(source: ExportSource, into: Path | None) -> Exported:
     commanded = [actuator for actuator in robot.actuators if actuator.reference is None]
     scales = [units[actuator.dimension].factor_to_si for actuator in commanded]
     table = robot.parameters
+    template = files("loopcal.io.formats").joinpath("kinematics.comp").read_text("utf-8")
+    code = fill_template(robot, places)
+    names = _name_pins([table.names[place] for place in places], template + code)
     pins, values = [], []
-    for place in places:
+    for place, pin in zip(places, names, strict=True):
         own = robot.get_unit(table.dimensions[place])
         number = float(robot.values[place] / own.factor_to_si)
-        pins.append(f'pin in float {table.names[place]} = {number!r} "in {own.symbol}";')
-        name = _name_variable(table.names[place])
-        values.append(f"        {name} * {own.factor_to_si!r},")
+        what = _quote(f"{table.names[place]} in {own.symbol}")
+        pins.append(f"pin in float {pin} = {number!r} {what};")
+        values.append(f"        {_name_variable(pin)} * {own.factor_to_si!r},")
     axis_units = [
         units[Dimension.LENGTH if name in "xyz" else Dimension.ANGLE].factor_to_si
         for name in robot.controlled
@@ -64,15 +71,14 @@ def write(source: ExportSource, into: Path | None) -> Exported:
         f"    c[{i}] = world->{AXES[name]} * AXIS_UNIT[{i}];"
         for i, name in enumerate(robot.controlled)
     ]
-    template = files("loopcal.io.formats").joinpath("kinematics.comp").read_text("utf-8")
     text = template.format(
         name=NAME,
-        robot=robot.name.replace('"', "'"),
+        title=_quote(f"Kinematics of {robot.name}, identified by loopcal"),
         unit=unit.symbol,
-        ini="\n".join(_list_settings(robot)),
-        example=table.names[places[0]] if places else "...",
+        ini="\n".join(_list_settings(robot, units)),
+        example=names[0] if names else "...",
         pins="\n".join(pins or ["pin out bit ready = 1;"]),
-        code=fill_template(robot, places),
+        code=code,
         joint_units="{" + ", ".join(map(repr, scales)) + "}",
         axis_units="{" + ", ".join(map(repr, axis_units)) + "}",
         values="\n".join(values),
@@ -82,12 +88,36 @@ def write(source: ExportSource, into: Path | None) -> Exported:
     return Exported(text, ())
 
 
+def _quote(text: str) -> str:
+    """Return a text as a string of C, in which some marks have a meaning."""
+    return '"' + re.sub(r'["\\?]', "'", text) + '"'
+
+
+def _name_pins(parameters: Sequence[str], code: str) -> list[str]:
+    """Return the name of each parameter's pin: of letters, digits, points and hyphens, short enough
+    for HAL, and in C, where pins are macros, unlike each other and the words of the code.
+    """
+    taken = set(re.findall(r"\w+", code))
+    pins = []
+    for parameter in parameters:
+        plain = re.sub(r"[^A-Za-z0-9.]+", "-", parameter)
+        own = re.sub(r"[.-]*\.[.-]*", ".", plain)[-LONGEST:].strip(".-")
+        own = own if own[:1].isalpha() else f"pin{own}"
+        name, i = own[:LONGEST].rstrip(".-"), 2
+        while _name_variable(name) in taken:
+            ending = f"-{i}"
+            name, i = own[: LONGEST - len(ending)].rstrip(".-") + ending, i + 1
+        taken.add(_name_variable(name))
+        pins.append(name)
+    return pins
+
+
 def _name_variable(pin: str) -> str:
     """Return the name of a pin's value in C, as halcompile makes it."""
     return pin.replace(".", "_").replace("-", "_")
 
 
-def _list_settings(robot: Mechanism) -> list[str]:
+def _list_settings(robot: Mechanism, units: Mapping[Dimension, Unit]) -> list[str]:
     """Return the lines of the INI file that the machine needs."""
     home = compute_readings(robot, robot.values[None], robot.home_state)[0, 0]
     commanded = [a.reference is None for a in robot.actuators]
@@ -95,7 +125,7 @@ def _list_settings(robot: Mechanism) -> list[str]:
     for i, (actuator, reading) in enumerate(
         (a, r) for a, r, use in zip(robot.actuators, home, commanded, strict=True) if use
     ):
-        own = robot.get_unit(actuator.dimension)
+        own = units[actuator.dimension]
         kind = "LINEAR" if actuator.dimension is Dimension.LENGTH else "ANGULAR"
         low, high = actuator.stroke or (-np.inf, np.inf)
         lines += [f"    [JOINT_{i}]", f"    TYPE = {kind}"]
