@@ -212,7 +212,7 @@ def _parse_condition(text: str) -> tuple[str, float]:
     name, _, value = text.partition("=")
     dimension = {d.value: d for d in Dimension}.get(name.partition(".")[0])
     if dimension is None or not value:
-        raise UnitError(f"{text!r} is no condition; write temperature=35 or force.z=-500N")
+        raise UnitError(f"{text!r} is not a condition. Write temperature=35 or force.z=-500N")
     number = parse_number(value)
     return name, parse_quantity(value, dimension) if number is None else number
 

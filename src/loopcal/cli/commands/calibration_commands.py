@@ -25,7 +25,7 @@ def calibrate(
     robot: str = opt.ROBOT,
     data: tuple[Path, ...] = opt.data(),
     output: Path | None = opt.path(
-        "Run folder to make. Without it the result is only shown.", "-o"
+        "Run folder to make. Without it the command only shows the result.", "-o"
     ),
     hold_out: float = opt.option(
         "Share of the poses, from 0 to below 1, to keep out of the fit for validation, such as "
@@ -247,7 +247,7 @@ def validate(
 def compensate(
     run: Path = opt.RUN,
     targets: Path = opt.argument("TARGETS", type=opt.FILE),
-    output: Path | None = opt.path("CSV file to write. Without it the CSV text is printed.", "-o"),
+    output: Path | None = opt.path("CSV file to write. Default: standard output.", "-o"),
     mode: Literal["readings", "commands"] = opt.option(
         "Actuator readings to set, or shifted commands for a controller with a fixed geometry.",
         of="loopcal.apply.compensation:compensate",

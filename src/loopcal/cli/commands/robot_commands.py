@@ -99,7 +99,7 @@ def new(
 @opt.command()
 def schema(
     file: str = opt.argument("KIND", type=click.Choice(list(SCHEMAS))),
-    output: Path | None = opt.path("File to write. Without it the schema is printed.", "-o"),
+    output: Path | None = opt.path("File to write. Default: standard output.", "-o"),
     force: bool = opt.force("the file"),
 ) -> Output:
     """Print the JSON Schema of a kind of file: robot, settings (of a measurement file), profile or

@@ -366,8 +366,8 @@ RULES: tuple[ColumnRule, ...] = (
     ColumnRule(
         f"{SIGMA}NAME",
         "of NAME",
-        "standard deviation of a measured value or reading in this row. `inf` marks a reading "
-        "without trust",
+        "standard deviation of a measured value or reading in this row. `inf` marks an "
+        "untrusted reading",
         lambda robot, kinds: [
             *(
                 NumberColumn(SIGMA + a.name, a.dimension, robot.units[a.dimension], True)
