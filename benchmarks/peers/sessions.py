@@ -50,6 +50,7 @@ def main() -> int:
             (rows,), file = data.observations, Path(name) / "numbers.txt"
             kind, entries = rows.kind, robot.parameters.entries
             assert isinstance(kind, Position)
+            assert kind.places is not None
             number = np.unique(rows.session, return_inverse=True)[1]
             station = encode_rotation(np.eye(3), kind.T_base_frame[:3, :3])
             start = np.r_[station, kind.T_base_frame[:3, 3], kind.places.ravel()]
