@@ -277,10 +277,10 @@ def test_motions_of_frames_are_those_that_all_rows_leave_open(monkeypatch, robot
         unfixed_motions.FrameRows, "add_rows", lambda *parts: (folded.append(1), fold(*parts))
     )
     fit = identify(robot, measured, LeastSquares())
+    assert fit.posterior.frames is not None
     assert len(folded) == (2 if count else 1)  # where all motions are fixed, no more rows are
     monkeypatch.setattr(unfixed_motions, "FIXED", np.inf)
     plain = identify(robot, measured, LeastSquares())
-    assert fit.posterior.frames is not None
     assert plain.posterior.frames is not None
     unfixed, expected = fit.posterior.frames.unfixed, plain.posterior.frames.unfixed
     assert expected.shape[1] == count

@@ -378,17 +378,13 @@ def compare_poses(T: FloatArray, reference: FloatArray) -> tuple[FloatArray, Flo
 def collect_versions() -> dict[str, str]:
     """Return the versions of loopcal, numpy, scipy and Python, and the engine of this process."""
     import platform
-    from runpy import run_path
 
-    # without scipy and importlib.metadata, whose import takes a third of the time of that of numpy
-    spec = find_spec("scipy")
-    assert spec is not None
-    assert spec.origin is not None
-    of_scipy = run_path(os.path.join(os.path.dirname(spec.origin), "version.py"))  # noqa: PTH118, PTH120
+    import scipy
+
     return {
         "loopcal": __version__,
         "numpy": np.__version__,
-        "scipy": of_scipy["version"],
+        "scipy": scipy.__version__,
         "python": platform.python_version(),
         "engine": str(get_current_engine()),
     }

@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """The real LinuxCNC with simulated axes runs the exported kinematics."""
 
+import fcntl
 import json
 import os
 import shutil
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from tempfile import TemporaryDirectory, gettempdir
 from typing import NamedTuple
 
 import numpy as np
@@ -139,9 +140,13 @@ def calibrated(tmp_path_factory: pytest.TempPathFactory) -> Calibrated:
 
 @pytest.fixture
 def component(tmp_path: Path) -> Iterator[Path]:
-    """Where the component of a test stands; it is removed from LinuxCNC afterwards."""
-    yield tmp_path / f"{NAME}.comp"
-    (MODULES / f"{NAME}.so").unlink(missing_ok=True)
+    """Where the component of a test stands; it is removed from LinuxCNC afterwards, which runs once
+    at a time on a machine.
+    """
+    with (Path(gettempdir()) / "linuxcnc-of-tests.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield tmp_path / f"{NAME}.comp"
+        (MODULES / f"{NAME}.so").unlink(missing_ok=True)
 
 
 def run_linuxcnc(kinematics: str, hal: str, homes: np.ndarray, poses: np.ndarray) -> np.ndarray:
