@@ -393,7 +393,7 @@ RULES: tuple[ColumnRule, ...] = (
     ColumnRule(
         TIME,
         "[s], [ms], [min], [h] or none",
-        "time of the row, without a unit: date and time of ISO 8601",
+        "time of the row. Without a unit: date and time of ISO 8601",
         lambda _robot, _kinds: (ContextColumn(TIME),),
     ),
     ColumnRule(
