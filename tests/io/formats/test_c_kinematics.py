@@ -14,6 +14,8 @@ import loopcal as lc
 from loopcal.cli.entry_point import main
 from loopcal.io.formats.c_kinematics import fill_template, list_movable, write
 from loopcal.io.formats.program_format import ExportSource
+from tests.mechanism.actuation.test_couplings import BELT
+from tests.over_constrained import EXECHON
 from tests.robot_texts import load_text
 from tests.zoo import ROBOTS
 
@@ -144,6 +146,17 @@ def test_more_drives_than_freedoms_agree_or_are_refused(tmp_path: Path) -> None:
     assert "0 failed" in compile_and_run(export_text(robot), tmp_path)
     with pytest.raises(lc.LoopcalError, match="more drives than freedoms"):
         export_text(load_text(tmp_path, FOUR_ARMS.replace("ELBOW", ELBOW)))
+
+
+LEAST_SQUARES = EXECHON.replace("family: limbs", "family: limbs\nclosure: least-squares")
+
+
+@pytest.mark.parametrize("text", [LEAST_SQUARES, BELT], ids=["exechon", "belt"])
+def test_loops_that_stay_open_agree(text: str, tmp_path: Path) -> None:
+    """Readings hold while the gaps are minimized, and lead to the coordinates."""
+    robot = draw_machine(load_text(tmp_path, text))
+    assert lc.forward(robot, lc.inverse(robot, robot.home[None]).q).residual[0] > 1e-6
+    assert compile_and_run(export_text(robot), tmp_path).startswith("50 poses, 0 failed")
 
 
 class Library:

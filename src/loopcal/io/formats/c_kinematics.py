@@ -228,14 +228,16 @@ def _write_tables(
     joints = tables.joints
     of_drive = [next(i for i, j in enumerate(joints) if j.drive == d) for d in range(drives)]
     names = robot.controlled
+    programs = [stage.robot.program for stage in robot.blocks]
+    stays_open = any(program.may_stay_open for program in programs)
     is_given = len(robot.blocks) == 1 and determine_platform(robot) and not moves_by_drives(robot)
+    is_given &= not stays_open
     closure, fixed = (
         sum(limb.rows for limb in tables.limbs),
         sum(s.reading < 0 for s in tables.sums),
     )
     unknown = np.sum(tables.moves) + sum(joint.is_passive for joint in joints) + drives
     has_spare = not is_given and closure + fixed + len(names) < unknown
-    programs = [stage.robot.program for stage in robot.blocks]
     spans = np.ones(drives)
     if has_spare:
         spans = measure_spans(robot, np.array([joints[i].turns for i in of_drive]))
@@ -257,7 +259,8 @@ def _write_tables(
         "TRIANGLES": any(any(s.triangle) for s in tables.sums),
         "HAS_SUMS": any(stage.robot.has_sums for stage in robot.blocks),
         "HAS_SPARE_DRIVES": has_spare,
-        "MAY_STAY_OPEN": any(p.may_stay_open or p.sigma is not None for p in programs),
+        "STAYS_OPEN": stays_open,
+        "MAY_STAY_OPEN": stays_open or any(p.sigma is not None for p in programs),
         "PLATFORM_IS_GIVEN": is_given,
         "PLACE_OF_PHI": names.index("phi") if "phi" in names else 0,
         "PLACE_OF_THETA": names.index("theta") if "theta" in names else 0,
