@@ -11,7 +11,7 @@ import pytest
 
 import loopcal as lc
 from loopcal.documents import load_record
-from loopcal.io.runs.certificate import TEMPLATE
+from loopcal.io.runs.certificate import read_template
 from loopcal.report.document.calibration_document import build_calibration_document, build_sections
 from loopcal.report.document.elements import Document, Form, Listing, Picture, Section, list_options
 from loopcal.results.tables import Table
@@ -43,7 +43,7 @@ def report(robot, data) -> lc.CalibrationReport:  # noqa: F811
 @pytest.fixture(scope="module")
 def document(report, tmp_path_factory) -> Document:
     path = tmp_path_factory.mktemp("facts") / "facts.yaml"
-    path.write_text(TEMPLATE.replace('serial_number: ""', 'serial_number: "0017"'), "utf-8")
+    path.write_text(read_template().replace('serial_number: ""', 'serial_number: "0017"'), "utf-8")
     return build_calibration_document(load_record(report, path))
 
 

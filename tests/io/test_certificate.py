@@ -15,7 +15,7 @@ import pytest
 import loopcal as lc
 from loopcal.cli.entry_point import main
 from loopcal.errors import DataError, FileError
-from loopcal.io.runs.certificate import TEMPLATE, format_certificate, load_administration
+from loopcal.io.runs.certificate import format_certificate, load_administration, read_template
 from loopcal.io.runs.run_folder import load_run_or_robot
 from tests.io.test_instruments import FACTS, data, robot, with_instrument  # noqa: F401
 
@@ -153,7 +153,7 @@ def run(tmp_path_factory, robot, data):  # noqa: F811
 
 def write_facts(folder, name="A", **changed):
     """Write administrative data, filled in, with some lines changed."""
-    text = TEMPLATE.replace('name: ""', f"name: {json.dumps(name)}")
+    text = read_template().replace('name: ""', f"name: {json.dumps(name)}")
     filled = {"serial_number": '"0017"', "number": '"2026-001"', "country": "DE"}
     filled |= dict.fromkeys(("begin", "end", "issued"), "2026-01-31")
     filled |= {"operator": "B", "value": "20.4 degC", "plus_minus": "0.6 K"}
@@ -303,7 +303,7 @@ def test_wrong_facts_are_refused_at_their_line(tmp_path, change, message) -> Non
 
 
 def test_template_must_be_filled_in(tmp_path) -> None:
-    (tmp_path / "facts.yaml").write_text(TEMPLATE, "utf-8")
+    (tmp_path / "facts.yaml").write_text(read_template(), "utf-8")
     with pytest.raises(FileError, match=r"facts.yaml:3: 'number' is empty. Fill it in"):
         load_administration(tmp_path / "facts.yaml")
     rows = load_administration(tmp_path / "facts.yaml", is_complete=False).list_rows()
@@ -320,7 +320,7 @@ def test_robot_files_have_no_certificate(tmp_path, robot) -> None:  # noqa: F811
 
 def test_commands_print_facts_and_certificate(tmp_path, run, capsys) -> None:
     assert main(["new", "--report-facts", str(tmp_path / "new.yaml")]) == 0
-    assert (tmp_path / "new.yaml").read_text("utf-8") == TEMPLATE
+    assert (tmp_path / "new.yaml").read_text("utf-8") == read_template()
     capsys.readouterr()
     facts = str(write_facts(tmp_path))
     assert main(["certificate", str(run), facts]) == 0

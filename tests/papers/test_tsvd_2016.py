@@ -39,6 +39,7 @@ from loopcal.studies.simulation.published_steps import (
     LIMIT,
     SINGLE,
     StepRule,
+    list_raw_units,
     penalize_ridge,
     penalize_truncated,
     take_steps,
@@ -89,7 +90,7 @@ def test_poses_parameter_errors_and_output_range_agree_with_the_paper() -> None:
     for name in steps.ROBOTS:
         assert len(steps.list_output_range(steps.load_design(name).robot)) == 96
     errors = np.abs(steps.draw_true_values(robot, 5, 0) - robot.parameters.nominal)
-    lengths = steps.list_scales(robot) != 1.0
+    lengths = list_raw_units(robot.parameters.dimensions) != 1.0
     for chosen, (low, high) in ((lengths, (0.05e-3, 0.1e-3)), (~lengths, (2.5e-4, 5e-4))):
         assert low < errors[:, chosen].min()
         assert errors[:, chosen].max() < high
@@ -105,7 +106,7 @@ def test_first_step_agrees_with_the_printed_formulas(name) -> None:
     robot, kind, readings = measured.robot, measured.kind, measured.trials.readings[None]
     nominal, scale, p, lam, k = (
         robot.values[None],
-        steps.list_scales(robot),
+        list_raw_units(robot.parameters.dimensions),
         len(robot.values),
         0.01,
         15,
@@ -141,7 +142,9 @@ def test_repeated_ridge_steps_reduce_the_effect_of_lambda() -> None:
     for m in (1, 3, 10):
         values = steps.iterate(measured, penalize_ridge(np.array([lam]), 33), limit=m).values
         f = 1.0 - (lam / (d.singular_values**2 + lam)) ** m
-        expected = d.deviation(f * d.projections / d.singular_values) * steps.list_scales(robot)
+        expected = d.deviation(f * d.projections / d.singular_values) * list_raw_units(
+            robot.parameters.dimensions
+        )
         # [m, rad] of 4e-6, second order
         np.testing.assert_allclose(values - robot.values, expected, rtol=0, atol=5e-10)
 

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from loopcal.cli.entry_point import main
-from loopcal.io.runs.certificate import TEMPLATE as CERTIFICATE_FACTS
+from loopcal.io.runs.certificate import read_template
 from loopcal.measure.kinds import KINDS
 from tools.fuzz.sources import SOURCES
 
@@ -161,7 +161,7 @@ def _build_machine(recipe: Recipe) -> Machine:
         run_command(f"simulate truth.yaml {recipe.instrument} --draw 7 --seed 3 -o more.csv")
         run_command("calibrate robot.yaml data.csv -o run --hold-out 0.3")
         run_command("calibrate robot.yaml more.csv -o later", is_needed=False)
-        Path("facts.yaml").write_text(CERTIFICATE_FACTS.replace(': ""', ": A1"), "utf-8")
+        Path("facts.yaml").write_text(read_template().replace(': ""', ": A1"), "utf-8")
         Path("targets.csv").write_text(recipe.targets, "utf-8")
         planned = "--poses 8 --hold-out 2 --candidates 16"
         if name in PLANNED:

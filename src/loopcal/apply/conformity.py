@@ -258,12 +258,11 @@ def judge_largest_error(
     )
 
 
-def judge_draws(draws: FloatArray, limit: float, level: float = LEVEL) -> Conformity:
+def judge_draws(draws: FloatArray, limit: float) -> Conformity:
     """Compare a true error, given as draws (n,) of its distribution, with an upper limit."""
-    _check_level(level)
-    low, middle, high, floor, bound = np.quantile(draws, [*INTERVAL, 1.0 - level, level]).tolist()
+    low, middle, high, floor, bound = np.quantile(draws, [*INTERVAL, 1.0 - LEVEL, LEVEL]).tolist()
     probability = float((draws <= limit).mean())
-    return Conformity(limit, middle, low, high, floor, bound, probability, probability, level)
+    return Conformity(limit, middle, low, high, floor, bound, probability, probability)
 
 
 def judge_limits(
@@ -356,9 +355,7 @@ def _check_level(level: float) -> None:
 
 
 def _collect_covariance(observations: Sequence[Observations], quantity: str) -> FloatArray | None:
-    """Return the covariances (e, 3, 3) of errors as `compute_row_errors` orders them; None where
-    nobody stated the noise of some.
-    """
+    """Return covariances (e, 3, 3) ordered as `compute_row_errors`; None for unstated noise."""
     covariances = [np.zeros((0, 3, 3))]
     for o in observations:
         for group in (g for g in o.kind.error_groups if g.quantity == quantity):

@@ -158,9 +158,7 @@ class ConsistentPoses(NamedTuple):
         return moved.states
 
 
-def remove_null_space(
-    factor: FloatArray, reference: FloatArray, tolerance: float = RANK_TOLERANCE
-) -> FloatArray:
+def remove_null_space(factor: FloatArray, reference: FloatArray) -> FloatArray:
     """Return a factor (t, p + 1, p + 1) without the directions that the rows of a reference with
     the same columns do not determine.
 
@@ -171,7 +169,7 @@ def remove_null_space(
     finite = np.isfinite(reference).all(axis=(1, 2))
     finite = np.asarray(finite & np.isfinite(factor).all(axis=(1, 2)))
     _, s, vt = np.linalg.svd(np.where(finite[:, None, None], reference[:, :p, :p], 0.0))
-    determined = are_nonzero(s, tolerance)
+    determined = are_nonzero(s, RANK_TOLERANCE)
     changed = np.flatnonzero(finite & ~determined.all(axis=1))
     if not changed.size:
         return factor

@@ -240,9 +240,7 @@ class ParameterChanges:
         return (*shares[:OF_NOISE], (total, float(combine_degrees(np.array(total), squares))))
 
     def compute_p_value(self, chi_square: float, degrees: int) -> float:
-        """Return the probability of a larger chi-square if nothing has changed; NaN without a
-        direction.
-        """
+        """Return the tail probability of chi-square if nothing changed; NaN without a direction."""
         if degrees == 0 or not np.isfinite(chi_square):
             return float("nan")
         return compute_averaged_tail(chi_square, degrees, self.sources)

@@ -135,9 +135,7 @@ class ResidualTest:
 
     @property
     def sigma_degrees(self) -> float:
-        """Degrees of freedom of s that come from the stated sigmas: nu0, or 0 where the residuals
-        contradict them.
-        """
+        """Degrees of freedom of s by the stated sigmas: nu0, or 0 where residuals contradict."""
         return self.noise_degrees if self.weighted else self.noise_degrees - max(self.degrees, 0.0)
 
     @property

@@ -91,9 +91,9 @@ class SmoothErrors:
         centers = x[apart if len(apart) >= fewest else _spread(x, fewest)]
         return np.argmin(((x[:, None] - centers) ** 2).sum(axis=2), axis=1)
 
-    def recentered(self, T: FloatArray, most: int = FINE_CENTERS) -> SmoothErrors:
-        """Return the errors with up to `most` of the poses T (n, 4, 4) as centers."""
-        return self._centered(self.normalize(T), most)
+    def recentered(self, T: FloatArray) -> SmoothErrors:
+        """Return the errors with up to `FINE_CENTERS` of the poses T (n, 4, 4) as centers."""
+        return self._centered(self.normalize(T), FINE_CENTERS)
 
     def _centered(self, x: FloatArray, most: int) -> SmoothErrors:
         """Return the errors with up to `most` of normalized coordinates (n, 6) as centers."""

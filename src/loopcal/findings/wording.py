@@ -66,9 +66,7 @@ class Quantity(NamedTuple):
     unit: str
 
     def __str__(self) -> str:
-        """Return three significant digits and a unit that suits the size; whole numbers below a
-        million.
-        """
+        """Return three significant digits, whole numbers below a million, and a fitting unit."""
         symbol, factor = choose_symbol(self.value, self.unit)
         value = factor * self.value
         if 999.5 <= abs(value) < 1e6:

@@ -159,9 +159,7 @@ def drive_loops(robot: Mechanism, values: FloatArray, q: FloatArray) -> tuple[Lo
 def follow_path(
     loops: Loops, joints: FloatArray, begin: State, state: State, wrong: BoolArray
 ) -> State:
-    """Solve the wrong rows along the straight path of joint values from the start, in smaller and
-    smaller steps.
-    """
+    """Solve the wrong rows along the straight path of joint values, in ever smaller steps."""
     robot, shape = loops.robot, (state.T.shape[0], state.T.shape[1])
     trial, pose = np.nonzero(wrong)
     loops = loops.select(trial, shape[0])
@@ -330,9 +328,7 @@ def close_loops(
     begin: State,
     max_iterations: int = ITERATIONS,
 ) -> State:
-    """Return the states (t, n) that Newton's method alone finds at readings q from `begin`, in
-    whatever mode.
-    """
+    """Return the states (t, n) at readings q by Newton's method alone from `begin`, in any mode."""
     if robot.stages:
         states = [
             close_loops(own.stage.robot, own.values, own.readings, own.state, max_iterations)

@@ -231,9 +231,9 @@ class PlanningProblem:
         missing = self.n_unknowns - self.n_earlier_equations
         return max(-(-missing // self.groups.rows.shape[1]), 1)
 
-    def build_criterion(self, name: str | None = None, target: Target | None = None) -> Criterion:
-        """Return criterion D, or I for a target; by default those of the options."""
-        name, target = name or self.options.criterion, target or self.options.target
+    def build_criterion(self, name: str | None = None) -> Criterion:
+        """Return criterion D, or I for the target; by default the criterion of the options."""
+        name, target = name or self.options.criterion, self.options.target
         if name == "D":
             return Criterion("D")
         rows, scale = getattr(self.prediction, target), 1.0
@@ -252,9 +252,7 @@ class PlanningProblem:
         return DesignProblem(rows, self.build_criterion(name), self.prior, counted=self.counted)
 
     def predict_errors(self, chosen: IntArray) -> ExpectedErrors | None:
-        """Return the errors expected after measuring groups (n,), possibly none; None where nothing
-        bounds them.
-        """
+        """Return the errors expected after measuring groups (n,); None if unbounded."""
         if len(chosen):
             factor = factor_design(self.groups.rows[chosen], self.prior, self.space)
         else:

@@ -61,7 +61,7 @@ def new(
     from loopcal.io.core.yaml_file import parse_yaml
     from loopcal.io.data.measurement_writer import format_template
     from loopcal.io.robot.robot_file import EDITOR_SCHEMA, build_robot, format_new_robot
-    from loopcal.io.runs.certificate import TEMPLATE
+    from loopcal.io.runs.certificate import read_template
 
     stated = unknown | instrument
     opt.make_instrument(stated)  # refuses wrong options before anything is written
@@ -86,7 +86,7 @@ def new(
     elif family or output or measurements or report_facts is None:
         raise DataError("a new robot file needs FAMILY and -o. Give both")
     if report_facts is not None:
-        texts[report_facts] = TEMPLATE
+        texts[report_facts] = read_template()
         page.append(f"{report_facts}: facts for reports and certificates. Fill in what you know.")
         page.append(suggest_command("report", "run", "--facts", report_facts, "--pdf"))
     with restore_on_failure(tuple(texts)):

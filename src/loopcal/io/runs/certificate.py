@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 from xml.etree.ElementTree import Element, indent, register_namespace, tostring
@@ -32,28 +33,6 @@ from loopcal.units import NUMBER, Dimension, find_unit
 
 if TYPE_CHECKING:
     from loopcal.io.runs.run_folder import Run
-
-TEMPLATE = """\
-# What documents of a calibration state beside its results: the first page of a report, which leaves
-# a line to fill in by hand for each missing text, and the digital certificate, which needs them.
-number: ""                    # unique identifier of the certificate, such as 2026-001
-language: en                  # ISO 639, two lower-case letters
-country: ""                   # where it is issued, ISO 3166, two capitals: DE
-place: laboratory             # laboratory, customer, laboratoryBranch, customerBranch or other
-begin: ""                     # first and last day of the calibration, and day of issue: 2026-01-31
-end: ""
-issued: ""
-machine: {name: "", manufacturer: "", model: "", serial_number: ""}
-laboratory: {name: "", city: "", country: "", street: "", post_code: "", email: ""}
-customer: {name: "", city: "", country: "", street: "", post_code: "", email: ""}
-operator: ""                  # who measured
-persons:                      # who answers for it; the signer first
-  - {name: "", role: ""}
-environment:                  # value and expanded uncertainty (k = 2) in degC, K, % or hPa
-  - {name: air temperature, value: "", plus_minus: ""}     # 20.4 degC, 0.6 K
-  - {name: relative humidity, value: "", plus_minus: ""}   # 45 %, 5 %
-"""
-"""The file to fill in."""
 
 CONDITION_UNITS = {
     "degC": r"\degreecelsius",
@@ -191,6 +170,11 @@ class Administration(_Texts):
             "signed by": str(self.persons[0]) if self.persons else "",
             "issued": self.issued,
         }
+
+
+def read_template() -> str:
+    """Return the file of report facts to fill in."""
+    return files("loopcal.io.runs").joinpath("report_facts.yaml").read_text("utf-8")
 
 
 def load_administration(path: str | Path, is_complete: bool = True) -> Administration:

@@ -442,9 +442,7 @@ class Kind(ABC):
         return [name for name in names if name in self._slices]
 
     def _sum_items(self, values: FloatArray, names: Sequence[str]) -> FloatArray:
-        """Return the sum (.., w) of the values of some setup items; of a drift, the parts of the
-        rows.
-        """
+        """Return the sum (.., w) of values of setup items; of a drift, the parts of the rows."""
         return np.asarray(sum(values[..., self._slices[name]] for name in names))
 
     def _add_shared_errors(

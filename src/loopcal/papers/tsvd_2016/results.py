@@ -36,7 +36,7 @@ from loopcal.papers.tsvd_2016.steps import (
     WHITENED,
     Sweep,
 )
-from loopcal.studies.simulation.published_steps import LINEARIZATIONS
+from loopcal.studies.simulation.published_steps import LINEARIZATIONS, list_raw_units
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension
 
@@ -301,7 +301,9 @@ def _count_drawn(sweep: Sweep, algorithm: str) -> int:
 
 def to_paper_units(study: steps.Study, values: FloatArray) -> FloatArray:
     """Return deviations from nominal [mm, rad] of the free ones of values (.., p)."""
-    deviations = (values - study.robot.parameters.nominal) / steps.list_scales(study.robot)
+    deviations = (values - study.robot.parameters.nominal) / list_raw_units(
+        study.robot.parameters.dimensions
+    )
     return deviations[..., study.design.free.places]
 
 
@@ -607,13 +609,9 @@ def _compare_speed(sweep: Sweep) -> Held:
     used = zip(SHOWN, (sweep.chosen[a] for a in (RANKED, RE, TSVD, EARLY)), strict=True)
     counts = {name: np.where(c.is_converged, c.iterations, np.inf) for name, c in used}
     least, tsvd = np.minimum(counts["ls"], counts["ridge"]), counts["tsvd"]
-    row = {name: show_count(np.median(count)) for name, count in counts.items()}
+    medians = {name: np.median(count) for name, count in counts.items()}
+    row = {n: f"{m:,.0f}" if np.isfinite(m) else "not converged" for n, m in medians.items()}
     return Held(tsvd < least, (tsvd >= least) & np.isfinite(least), row)
-
-
-def show_count(count: float) -> str:
-    """Return a number of iterations as text."""
-    return f"{count:,.0f}" if np.isfinite(count) else "not converged"
 
 
 def _compare_rule(sweep: Sweep) -> Held:

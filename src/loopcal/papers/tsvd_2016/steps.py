@@ -49,7 +49,6 @@ from loopcal.studies.simulation.published_steps import (
     RawProblem,
     RawSteps,
     StepRule,
-    list_raw_units,
     make_raw_problem,
     penalize_ridge,
     penalize_truncated,
@@ -373,11 +372,6 @@ def linearize(study: Study) -> Decomposition:
 def find_rank(study: Study) -> int:
     """Return the rank of the first machine's H."""
     return int(are_nonzero(linearize(study).singular_values[0]).sum())
-
-
-def list_scales(robot: Mechanism) -> FloatArray:
-    """Return the paper's units (p,) in SI: millimeters and radians."""
-    return list_raw_units(robot.parameters.dimensions)
 
 
 def locate_bottoms(errors: FloatArray, parts: Sequence[int]) -> IntArray:

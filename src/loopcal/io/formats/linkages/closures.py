@@ -406,9 +406,10 @@ def _split(tree: LinkTree, joint: TreeJoint, axes: FloatArray) -> Iterator[Graph
     first = _make_joint(tree, joint)
     body, bodies = first.body_a, [f"cross {i + 1} of {joint.name}" for i in range(len(axes) - 1)]
     for i, (axis, after) in enumerate(zip(axes, [*bodies, first.body_b], strict=True)):
+        name = "XYZ"[int(axis.argmax())] if axis.max() == 1.0 else str(i + 1)
         yield replace(
             first,
-            name=f"{joint.name}_{_name_axis(axis, i)}",
+            name=f"{joint.name}_{name}",
             kind="R",
             body_a=body,
             body_b=after,
@@ -419,11 +420,6 @@ def _split(tree: LinkTree, joint: TreeJoint, axes: FloatArray) -> Iterator[Graph
             limits=None,
         )
         body = after
-
-
-def _name_axis(axis: FloatArray, i: int) -> str:
-    """Return the letter of an axis of the frame, or a number."""
-    return "XYZ"[int(axis.argmax())] if axis.max() == 1.0 else str(i + 1)
 
 
 def _locate_error(error: MechanismError, tree: LinkTree, closures: Closures) -> FileError:
