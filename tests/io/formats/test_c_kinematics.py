@@ -14,7 +14,7 @@ import loopcal as lc
 from loopcal.cli.entry_point import main
 from loopcal.io.formats.c_kinematics import fill_template, list_movable, write
 from loopcal.io.formats.program_format import ExportSource
-from tests.mechanism.actuation.test_couplings import BELT
+from tests.mechanism.actuation.test_couplings import BELT, PINION
 from tests.over_constrained import EXECHON
 from tests.robot_texts import load_text
 from tests.zoo import ROBOTS
@@ -98,6 +98,20 @@ def test_the_command_writes_a_file_that_both_compilers_accept(tmp_path: Path) ->
         assert "0 failed" in compile_and_run(text, tmp_path, compiler=compiler)
 
 
+def test_a_compiler_of_cpp_accepts_the_file_and_links_it_from_c(tmp_path: Path) -> None:
+    robot = lc.load_robot("excavator")
+    (tmp_path / "kinematics.c").write_text(fill_template(robot, list_movable(robot)), "utf-8")
+    for language, source in (("c", "kinematics.c"), ("c++", "caller.cpp")):
+        call = "int main() { kinematics_state s; kinematics_home(&s); }"
+        head = '#define KINEMATICS_DECLARATIONS\n#include "kinematics.c"\n'
+        (tmp_path / "caller.cpp").write_text(head + call, "utf-8")
+        command = ["gcc", "-x", language, "-c", source, "-o", f"{language}.o"]
+        subprocess.run(command, cwd=tmp_path, check=True)
+    subprocess.run(["gcc", "c.o", "c++.o", "-lm"], cwd=tmp_path, check=True)
+    cpp = ["gcc", "-x", "c++", "-Wall", "-Wextra", "-Werror", "-c", "kinematics.c"]
+    subprocess.run(cpp, cwd=tmp_path, check=True)
+
+
 CALLER = """
 #define KINEMATICS_DECLARATIONS
 #include "kinematics.c"
@@ -151,7 +165,7 @@ def test_more_drives_than_freedoms_agree_or_are_refused(tmp_path: Path) -> None:
 LEAST_SQUARES = EXECHON.replace("family: limbs", "family: limbs\nclosure: least-squares")
 
 
-@pytest.mark.parametrize("text", [LEAST_SQUARES, BELT], ids=["exechon", "belt"])
+@pytest.mark.parametrize("text", [LEAST_SQUARES, BELT, PINION], ids=["exechon", "belt", "pinion"])
 def test_loops_that_stay_open_agree(text: str, tmp_path: Path) -> None:
     """Readings hold while the gaps are minimized, and lead to the coordinates."""
     robot = draw_machine(load_text(tmp_path, text))
@@ -208,10 +222,13 @@ def test_a_file_whose_parameters_move_no_link_compiles(tmp_path: Path) -> None:
     assert abs(library.call("forward", home, 12)[1][11] - 0.15) < 1e-12
 
 
-def test_a_robot_without_a_workspace_is_tested_around_home(tmp_path: Path) -> None:
+@pytest.mark.parametrize("workspace", ["", "workspace: {x: [900, 901], y: [900, 901]}\n"])
+def test_without_a_workspace_that_is_reached_poses_are_around_home(
+    workspace: str, tmp_path: Path
+) -> None:
     text = (Path(lc.__file__).parent / "robots" / "five-bar.yaml").read_text("utf-8")
-    robot = load_text(tmp_path, re.sub(r"^workspace:.*\n( .*\n)*", "", text, flags=re.M))
-    with pytest.raises(lc.MechanismError, match="no workspace"):
+    robot = load_text(tmp_path, re.sub(r"^workspace:.*\n", workspace, text, flags=re.M))
+    with pytest.raises(lc.MechanismError, match="workspace"):
         lc.sample_workspace(robot, 1)
     assert compile_and_run(export_text(robot), tmp_path).startswith("50 poses, 0 failed")
 

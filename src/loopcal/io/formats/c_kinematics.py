@@ -9,7 +9,6 @@ Derivation: docs/theory/kinematics.md.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterable, Sequence
 from importlib.resources import files
 from pathlib import Path
@@ -26,7 +25,7 @@ from loopcal.mechanism.chains import list_carrying_stages
 from loopcal.mechanism.inverse import determine_platform, measure_spans, moves_by_drives
 from loopcal.mechanism.model import Mechanism, Stage
 from loopcal.mechanism.platform_coordinates import EULER, POSITION, TILT, read_coordinates
-from loopcal.mechanism.solutions import Solution, jacobian
+from loopcal.mechanism.solutions import Solution, inverse, jacobian
 from loopcal.mechanism.transmission import (
     ALL_TERMS,
     FIXED,
@@ -41,7 +40,7 @@ from loopcal.mechanism.transmission import (
     select_table,
     select_weights,
 )
-from loopcal.mechanism.workspace import find_reachable, sample_workspace
+from loopcal.mechanism.workspace import sample_workspace
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import SI_SYMBOLS
 from loopcal.version import __version__
@@ -443,10 +442,20 @@ def _draw_poses(robot: Mechanism) -> tuple[FloatArray, Solution]:
         shares = np.random.default_rng(SEED).uniform(-1.0, 1.0, (TESTS, home.shape[1]))
         shares[0] = 0.0
         near = home + span * shares
-        good, solution = find_reachable(robot, near, Counter())
-        if not good.any():
+        solution = inverse(robot, near)
+        if not solution.converged.any():
             raise error
-        return near[good], solution.take(good)
+        return near[solution.converged], solution.take(solution.converged)
+
+
+def _choose_agreement(robot: Mechanism) -> float:
+    """Return the largest accepted difference of derivatives, of the largest one: rounding; where
+    loops stay open that of differences; with open sums loopcal neglects gaps over the size.
+    """
+    stages = [stage.robot for stage in robot.blocks]
+    if any(stage.program.may_stay_open and stage.has_open_sums for stage in stages):
+        return 1e-2
+    return 1e-6 if any(stage.program.may_stay_open for stage in stages) else 1e-9
 
 
 def _write_tests(robot: Mechanism, commanded: BoolArray) -> str:
@@ -457,6 +466,7 @@ def _write_tests(robot: Mechanism, commanded: BoolArray) -> str:
     parts = [
         f"#define TESTS {len(poses)}",
         f"#define AGREEMENT {_write(AGREEMENT * max(1.0, robot.size))}",
+        f"#define AGREEMENT_OF_SLOPES {_choose_agreement(robot)!r}",
         _table("double TEST_COORDINATES[TESTS][KINEMATICS_COORDINATES]", coordinates),
         _table("double TEST_READINGS[TESTS][KINEMATICS_READINGS]", solution.q[:, commanded]),
         _table("double TEST_POSES[TESTS][12]", map(_flatten, poses)),

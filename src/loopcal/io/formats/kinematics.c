@@ -7,6 +7,10 @@
 #ifndef LOOPCAL_KINEMATICS_H
 #define LOOPCAL_KINEMATICS_H
 
+#ifdef __cplusplus
+extern "C" {
+#endif
+
 enum {
     KINEMATICS_OK,
     KINEMATICS_UNREACHABLE, /* no closed loops were found near the state, or no readings for them */
@@ -39,6 +43,10 @@ int kinematics_jacobian(const kinematics_state *state, double by_reading[6][KINE
 #if KINEMATICS_PARAMETERS > 0
 /* Set all parameters, in SI units. No other call may run at the same time. */
 void kinematics_set_parameters(const double values[KINEMATICS_PARAMETERS]);
+#endif
+
+#ifdef __cplusplus
+}
 #endif
 
 #endif
@@ -813,7 +821,7 @@ static int solve(struct goal goal, kinematics_state *s)
  * 0 where they are not square. */
 static int find_sign(enum task task, const kinematics_state *s)
 {
-    static const double any[SUMS + KINEMATICS_COORDINATES + KINEMATICS_READINGS];
+    static const double any[SUMS + KINEMATICS_COORDINATES + KINEMATICS_READINGS] = {0};
     KINEMATICS_WORK struct equations e;
     struct goal goal;
     goal.task = task;
@@ -1156,7 +1164,7 @@ int main(void)
     }
     printf("%d poses, %d failed; differences at most %.1e of poses, %.1e of derivatives\n", TESTS,
            failed, worst, of_slopes / largest);
-    return failed > 0 || !(worst <= AGREEMENT) || !(of_slopes <= (STAYS_OPEN ? 1e-6 : 1e-9) * largest);
+    return failed > 0 || !(worst <= AGREEMENT) || !(of_slopes <= AGREEMENT_OF_SLOPES * largest);
 }
 #endif
 #endif
