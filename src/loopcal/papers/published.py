@@ -211,10 +211,6 @@ OWN_CHECK = "our own check, not a statement of the paper"
 """Place of a claim that the paper does not make."""
 
 
-THESE_MACHINES = "these machines"
-"""Of a claim that holds for the machines of the paper only."""
-
-
 @dataclass(frozen=True)
 class Verdict:
     """The judgement of one claim."""
@@ -320,7 +316,7 @@ class PaperText:
             agrees = decide_share(draws)
         claim, why = (fill_template(record[key], **data) for key in ("claim", "evidence"))
         agrees = None if agrees is None else bool(agrees)
-        is_elsewhere = agrees is False and elsewhere and record.get("of") == THESE_MACHINES
+        is_elsewhere = agrees is False and elsewhere and record.get("of") == "these machines"
         agrees = None if is_elsewhere else agrees
         where = record.get("where", OWN_CHECK)
         return Verdict(claim, agrees, why, where, name, draws, is_elsewhere)

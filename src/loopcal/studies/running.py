@@ -406,9 +406,7 @@ def run_study(
 ROBOT, TRUTH, DATA = "robot.yaml", "truth.yaml", "measurements.csv"
 """Files of the folder of inputs: the nominal robot, the true machine, and what was measured."""
 
-INPUTS = FolderKind(
-    "trial", "trial.json", ("study", "cell", "trial"), (ROBOT, TRUTH, DATA), filled_in=()
-)
+INPUTS = FolderKind("trial", "trial.json", ("study", "cell", "trial"), (ROBOT, TRUTH, DATA))
 """The folder of inputs; its document says which trial it is."""
 
 

@@ -57,8 +57,6 @@ TOUCHING = re.compile(r"(?<![A-Z\d])G30(?!\d)(?!.*P\s*\d).*S\s*-1(?!\d)")
 CALIBRATED = re.compile(r"Calibrated (\d+) factors using")
 HEIGHT_MAP = "RepRapFirmware height map file"
 GENERATED = re.compile(r"generated at (\d{4}-\d\d-\d\d)")
-UNPROBED = "0"
-"""Cell of a height map that was not probed."""
 
 OFFSETS = {"marlin": re.compile(r"\bM851\b(.*)"), "reprap": re.compile(r"\bG31\b(.*)")}
 """Command that states where the probe is beside the nozzle, and the height at which it triggers."""
@@ -336,5 +334,5 @@ def _read_height_map(path: Path, text: str) -> list[ProbedPoint]:
         ProbedPoint(x0 + k * dx, y0 + j * dy, parse_number(cell, "a height", path, line))
         for j, (line, row) in enumerate(rows)
         for k, cell in enumerate(row)
-        if cell != UNPROBED
+        if cell != "0"  # which was not probed
     ]

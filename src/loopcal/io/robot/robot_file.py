@@ -391,8 +391,6 @@ def place_stages(file: YamlFile, chain: RobotRecord, units: Units) -> RobotRecor
 
 # Stored values of parameters to compare a fit with: published ones, or those of a firmware.
 
-STORED_WHAT = "file of stored values"
-
 
 def load_stored_values(path: str | Path, robot: Mechanism) -> dict[str, float] | Mechanism:
     """Return the stored values of a robot's parameters by name [SI], or a robot that has them.
@@ -405,7 +403,7 @@ def load_stored_values(path: str | Path, robot: Mechanism) -> dict[str, float] |
     ------
     FileError : unreadable, neither of the two, or a bad row; with its line.
     """
-    file = read_yaml(find_robot_file(path), STORED_WHAT)
+    file = read_yaml(find_robot_file(path), "file of stored values")
     if "family" in file.content:
         return build_robot(file)
     if TABLE not in file.content:

@@ -36,9 +36,6 @@ RESULT = "result.json"
 FORMAT = 2
 """Format of result.json; runs of format 1 lack `files`, and may lack keys that came later."""
 
-REPEAT = "restore the run folder from a copy, or repeat the calibration"
-"""What to do about a damaged run."""
-
 _SURROGATE = re.compile("[\ud800-\udfff]")
 """Half a character: part of a file name that is not UTF-8."""
 
@@ -144,7 +141,8 @@ def read_result(path: Path) -> dict[str, Any]:
     """Return the content of result.json of a run, of which `STATED` is checked; FileError
     where it is no run, made by a newer loopcal, or damaged.
     """
-    content = read_json(path, "run result", f"this file of a run is damaged; {REPEAT}", TABLE_SIZE)
+    action = "restore the run folder from a copy, or repeat the calibration"
+    content = read_json(path, "run result", f"this file of a run is damaged; {action}", TABLE_SIZE)
     if not isinstance(content, dict):
         raise report_damage(path, "it contains no mapping")
     number = content.get("format")

@@ -401,7 +401,6 @@ NOT_TRACEABLE = (
     "The data have no serial number, certificate or date of calibration of the instrument, so "
     "this report does not show traceability."
 )
-NO_BUDGET = "This fit has no intervals, so there is no uncertainty budget."
 
 
 @describes_section("budget", "Uncertainty budget")
@@ -409,7 +408,7 @@ def describe_budget(record: CalibrationRecord) -> Iterator[Element]:
     """Yield the uncertainty budget by source, and the stated facts of each instrument."""
     budget = record.result.get("expected_error")
     if not budget or budget.get("sources") is None:
-        yield NO_BUDGET
+        yield "This fit has no intervals, so there is no uncertainty budget."
     else:
         yield BUDGET_TERMS
         if not record.result.get("states_expected_error"):
@@ -521,18 +520,16 @@ EVERYWHERE = (
     "and in the formats of controllers that can express it. Where a note says that these values "
     "move programs, it also writes others that leave them where they are, if there are any."
 )
-NO_CONTROLLER = "No format of a controller that loopcal writes can express this robot."
-FAILED = "The calibration failed, so the report has no values for a controller."
 
 
 @describes_section("controller", "Values for the controller")
 def describe_controllers(record: CalibrationRecord) -> Iterator[Element]:
     """Yield what to write into which controller."""
     if record.verdict is Verdict.NOT_CALIBRATED:
-        yield FAILED
+        yield "The calibration failed, so the report has no values for a controller."
         return
     if not record.controllers:
-        yield NO_CONTROLLER
+        yield "No format of a controller that loopcal writes can express this robot."
     noted = [note for values in record.controllers for note in values.notes]
     of_all = {note for note in noted if 1 < noted.count(note) == len(record.controllers)}
     for values in record.controllers:

@@ -41,7 +41,6 @@ MEANING = (
     "tested in the directions that both data sets determine. If nothing has changed, a change is "
     "reported in 5 % of cases, for all runs together."
 )
-NO_SHIFTS = "The runs share data or have no common direction, so loopcal tested no shift."
 
 
 def build_comparison_document(comparison: RunComparison, made_by: str) -> Document:
@@ -85,7 +84,7 @@ def _describe_parameters(comparison: RunComparison) -> Iterator[Element]:
 def _describe_shifts(comparison: RunComparison) -> Iterator[Element]:
     """Yield the tested shifts in standard deviations."""
     if all(pair.moved is None for pair in comparison.pairs):
-        yield NO_SHIFTS
+        yield "The runs share data or have no common direction, so loopcal tested no shift."
         return
     yield make_picture(
         draw_run_shifts(comparison),
