@@ -253,6 +253,7 @@ def _write_tables(
         "DRIVES": drives,
         "SUMS": len(tables.sums),
         "CLOSURE_ROWS": closure,
+        "COLUMNS": unknown,
         "MOST_JOINTS": max(limb.joints for limb in tables.limbs),
         "PIECES": len(tables.pieces),
         "TRIANGLES": any(any(s.triangle) for s in tables.sums),

@@ -124,7 +124,6 @@ struct stage {
 #define CLOSED 1e-9   /* residual of closed loops, relative to the size */
 #define ROUNDING 1e-13
 #define LONG 0.5      /* longest step, relative to the size */
-#define COLUMNS (6 * BODIES + JOINTS + DRIVES)
 #define WIDTH (COLUMNS + KINEMATICS_READINGS)
 #define ROWS (CLOSURE_ROWS + SUMS + KINEMATICS_COORDINATES + DRIVES)
 /* Weight of sums and coordinates where other rows do not close: these hold. */
