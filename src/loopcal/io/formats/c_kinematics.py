@@ -19,7 +19,7 @@ import numpy as np
 from loopcal.engine.numpy_engine.closure import place_links
 from loopcal.engine.program import BASE, LENGTH, PITCH
 from loopcal.errors import DataError, MechanismError
-from loopcal.findings import report_finding
+from loopcal.findings import Finding, report_finding
 from loopcal.io.formats.program_format import Exported, ExportSource, Format
 from loopcal.mechanism.chains import list_carrying_stages
 from loopcal.mechanism.inverse import determine_platform, measure_spans, moves_by_drives
@@ -127,7 +127,7 @@ def write(source: ExportSource, into: Path | None) -> Exported:
     DataError : the robot has more drives than freedoms, in limbs with passive joints.
     """
     del into
-    return Exported(fill_template(source.robot, ()), ())
+    return Exported(fill_template(source.robot, ()), note_lost_terms(source.robot, FORMAT.name))
 
 
 def fill_template(robot: Mechanism, parameters: Sequence[int]) -> str:
@@ -138,6 +138,21 @@ def fill_template(robot: Mechanism, parameters: Sequence[int]) -> str:
     for mark, part in (("HEAD", head), ("TABLES", body), ("TESTS", _write_tests(robot, commanded))):
         text = text.replace(f"/* {mark} */", part)
     return text
+
+
+def note_lost_terms(robot: Mechanism, name: str) -> tuple[Finding, ...]:
+    """Return a finding about terms of drives that a C file has no inputs for: backlash depends on
+    the direction of approach, compliance on the load.
+    """
+    lost = []
+    for stage in robot.blocks:
+        _, tau = stage.robot.slots(robot.values[None, stage.parameters])
+        drives = robot.actuators[stage.actuators]
+        for row, terms in zip(stage.robot.slots.constants, tau[0], strict=True):
+            own = (term for term, value in zip(TERMS, terms, strict=False) if value)
+            if row[SOURCE] >= 0:
+                lost += [f"{drives[int(row[SOURCE])].name}.{t}" for t in own if t not in SHAPES]
+    return (report_finding("files.not-expressed", format=name, names=tuple(lost)),) if lost else ()
 
 
 def list_movable(robot: Mechanism) -> list[int]:

@@ -19,7 +19,7 @@ import numpy as np
 
 from loopcal.errors import DataError
 from loopcal.findings import report_finding
-from loopcal.io.formats.c_kinematics import fill_template, list_movable
+from loopcal.io.formats.c_kinematics import fill_template, list_movable, note_lost_terms
 from loopcal.io.formats.program_format import Exported, ExportSource, Format
 from loopcal.mechanism.kinematics import compute_readings
 from loopcal.mechanism.model import Mechanism
@@ -85,7 +85,7 @@ def write(source: ExportSource, into: Path | None) -> Exported:
         to_world="\n".join(to_world),
         from_world="\n".join(from_world),
     )
-    return Exported(text, ())
+    return Exported(text, note_lost_terms(robot, FORMAT.name))
 
 
 def _quote(text: str) -> str:
