@@ -491,9 +491,19 @@ KEYS = ("poses", "controller")
 """Settings of measurement files that name another file."""
 
 
-def find_reference(file: YamlFile, key: str) -> Path | None:
-    """Return the file that the setting `key` names, see `find_file_beside`."""
-    return find_file_beside(file, str(file.content[key]), (key,))
+def find_reference(
+    file: YamlFile, key: str, known: Mapping[str, Path] | None = None
+) -> Path | None:
+    """Return the file that the setting `key` names, beside `file` or as one of those `known` by
+    name; None without the setting. FileError : there is none, or see `find_file_beside`.
+    """
+    if (stated := file.content.get(key)) is None:
+        return None
+    path = find_file_beside(file, str(stated), (key,)) or (known or {}).get(str(stated))
+    if path is None:
+        finding = report_finding("files.reference-missing", key=key, path=str(stated))
+        raise file.error(finding, (key,))
+    return path
 
 
 def find_file_beside(file: YamlFile, name: str, location: Location) -> Path | None:

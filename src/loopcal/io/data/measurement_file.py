@@ -382,15 +382,8 @@ def _load_controller(table: Table, robot: Mechanism) -> Mechanism | None:
             )
             raise table.settings.error(f"{sentence}. Remove 'controller'", ("controller",))
         return None
-    if name is None:
-        return robot.nominal
-    beside = find_reference(table.settings, "controller")
-    if beside is None:
-        beside = list_shipped_robots().get(str(name))
-    if beside is None:
-        finding = report_finding("files.reference-missing", key="controller", path=str(name))
-        raise table.settings.error(finding, ("controller",))
-    return load_robot(beside)
+    beside = find_reference(table.settings, "controller", list_shipped_robots())
+    return robot.nominal if beside is None else load_robot(beside)
 
 
 def _states_reading_noise(table: Table, robot: Mechanism) -> bool:
@@ -657,14 +650,8 @@ def read_tables(path: Paths) -> tuple[Table, ...]:
             check_format(table.settings, FORMAT)
         tables.append(table)
     for table in tuple(tables):
-        name = table.settings.content.get("poses")
-        if name is None:
-            continue
         beside = find_reference(table.settings, "poses")
-        if beside is None:
-            finding = report_finding("files.reference-missing", key="poses", path=str(name))
-            raise table.settings.error(finding, ("poses",))
-        if not any(beside.samefile(other.path) for other in tables):
+        if beside is not None and not any(beside.samefile(other.path) for other in tables):
             tables.append(read_table(beside))
     return tuple(tables)
 
