@@ -233,6 +233,15 @@ def test_without_a_workspace_that_is_reached_poses_are_around_home(
     assert compile_and_run(export_text(robot), tmp_path).startswith("50 poses, 0 failed")
 
 
+def test_a_steep_cam_agrees(tmp_path: Path) -> None:
+    """Newton's method alone does not end from its flat part."""
+    shipped = (Path(lc.__file__).parent / "robots" / "hexapod-42.yaml").read_text("utf-8")
+    points = "[[-75, -60], [-70, -50], [-60, 50], [75, 60]]"
+    drive = f"{{reads: length, gain: 0, table: {points}, interpolation: linear}}"
+    robot = load_text(tmp_path, f"{shipped}drives: {{q1: {drive}}}\n")
+    assert compile_and_run(export_text(robot), tmp_path).startswith("50 poses, 0 failed")
+
+
 def test_a_pose_that_no_reading_gives_has_a_status(tmp_path: Path) -> None:
     """The screw turns back before its leg is as long as the pose needs."""
     shipped = (Path(lc.__file__).parent / "robots" / "hexapod-42.yaml").read_text("utf-8")

@@ -309,6 +309,15 @@ static double find_reading(int i, double sum, double begin)
 #endif
     if (t->term[1] != 0.0 && t->pieces == 0)
         r = (sum - t->term[0]) / t->term[1];
+#if PIECES > 0
+    for (k = 0; k < t->pieces; k++) {
+        /* on the line between the ends of the piece that the sum lies in */
+        const double *piece = PIECE[t->piece + k];
+        double low = transmit(i, piece[0], &slope), high = transmit(i, piece[1], &slope);
+        if ((low <= sum) != (high <= sum))
+            r = piece[0] + (piece[1] - piece[0]) * (sum - low) / (high - low);
+    }
+#endif
     for (k = 0; k < 20; k++) {
         step = (transmit(i, r, &slope) - sum) / slope;
         r -= step;
