@@ -97,7 +97,7 @@ class HeightErrors(DrawnResult):
     )
 
     def statistics(self, errors: str, held_out: bool) -> Statistics:
-        """Return the statistics "before" or "after" of the held-out or the fitted heights [m]."""
+        """Return the error statistics "before" or "after" of held-out or fitted heights [m]."""
         return compute_statistics(np.abs(getattr(self, errors)[self.is_held_out == held_out]))
 
     def report_alternatives(self, count: int) -> list[Finding]:

@@ -254,7 +254,7 @@ def _build_rows(repeats: _Repeats) -> tuple[FloatArray, FloatArray, float]:
 
 
 def _spread_motions(rows: FloatArray) -> FloatArray:
-    """Return rows (E 3 k, 3 k + 6 (E - 1)): each measurement but the first has a motion."""
+    """Return rows (E 3 k, 3 k + 6 (E - 1)): each measurement but the first has its own motion."""
     E, m = rows.shape[:2]
     spread = np.zeros((E, m, m + 6 * (E - 1)))
     spread[:, :, :m] = rows[:, :, :m]

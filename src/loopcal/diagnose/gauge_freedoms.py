@@ -273,7 +273,7 @@ def report_readings_gauge(freedoms: GaugeFreedoms) -> Finding:
 
 
 def twist_weights(size: float) -> FloatArray:
-    """Return (6,) factors that turn rotations [rad] into displacements [m]: size, and one."""
+    """Return (6,) factors that turn rotations [rad] into displacements [m]: the size, and one."""
     return np.array([size] * 3 + [1.0] * 3)
 
 

@@ -292,7 +292,7 @@ class ParameterChanges:
         )
 
     def project_out(self, places: list[int]) -> tuple[float, int]:
-        """Return chi-square and its degrees of freedom where some parameters may have changed."""
+        """Return chi-square left where some parameters may have changed, and its degrees."""
         explained = self.find_span(places).T @ self.value
         left = max(self.chi_square - float(explained @ explained), 0.0)
         return left, self.degrees - len(explained)

@@ -82,7 +82,7 @@ def check_types(robot: object, data: object) -> None:
 
 
 def check_actuators(measurements: Measurements, robot: Mechanism) -> None:
-    """Refuse other types, wrong numbers of readings, and readings alone without information."""
+    """Refuse other types, not one reading per actuator, and readings without information."""
     check_types(robot, measurements)
     columns, names = measurements.readings.shape[1], tuple(a.name for a in robot.actuators)
     if columns != len(names):
@@ -359,7 +359,7 @@ def _find_static_targets(measurements: Measurements) -> Iterator[_StaticTarget]:
 
 
 def _group_equal_kinds(observations: tuple[Observations, ...]) -> list[list[Observations]]:
-    """Return observations in groups of one class and settings, as of several files."""
+    """Return observations in groups of one class and settings, as two files of one instrument."""
 
     def are_equal(kind: Kind, other: Kind) -> bool:
         names = [field.name for field in fields(kind) if field.init]

@@ -211,7 +211,7 @@ def stack_sum_rows(
 def differentiate_unknowns_by_sums(
     program: Program, e: FloatArray, state: State, weights: FloatArray
 ) -> FloatArray:
-    """Return derivatives (t, n, M + J, r) of freedoms and driven joints by their sums."""
+    """Return derivatives (t, n, M + J, r) of freedoms and driven joints by weighted sums."""
     blocks = engine.linearize(program, e, program.list_drives(state.joints), state)
     rows = stack_sum_rows(program, blocks, weights)
     return invert_rows(rows)[..., rows.shape[2] - weights.shape[1] :]
@@ -277,7 +277,7 @@ def differentiate_open_sums(
 def differentiate_driven_joints(
     robot: Mechanism, values: FloatArray, q: FloatArray, state: State
 ) -> FloatArray:
-    """Return the derivatives (t | 1, n | 1, J, p + a) of driven joints by all inputs [SI]."""
+    """Return derivatives (t | 1, n | 1, J, p + a) of driven joints by parameters and readings."""
     if robot.has_open_sums:
         M = len(robot.program.unknown_twists)
         return _differentiate_open(robot, values, q, state)[:, :, M:]

@@ -57,7 +57,7 @@ MAIN_SHARE = 0.3
 
 
 def check_mobility(robot: Mechanism) -> None:
-    """Refuse actuators that cannot move and hold the platform at home; name its freedoms."""
+    """Refuse actuators that cannot move and hold the platform at home; the error names freedoms."""
     program, home = robot.program, robot.home_state
     e = robot.slots(robot.values[None])[0]
     blocks = engine.linearize(program, e, driven_values(program, home), home)

@@ -198,7 +198,7 @@ def _name_directions(
 
 
 def _list_columns(robot: Mechanism, limb: int) -> dict[int, int]:
-    """Return freedom -> column of A, of the body on which a limb ends, or else begins."""
+    """Return freedom -> column of A, of the body on which a limb ends, or begins (end on base)."""
     ((group, k),) = ((g, g.limbs.index(limb)) for g in robot.program.groups if limb in g.limbs)
     body = group.to[k] if group.to[k] != engine.BASE else group.on[k]
     twists = enumerate(robot.program.unknown_twists)

@@ -124,7 +124,7 @@ def contracts(robot: Mechanism, start: State, end: State) -> BoolArray:
 
 
 def measure_distance(robot: Mechanism, a: State, b: State) -> FloatArray:
-    """Return the largest difference (n,) of states (1, n | 1), lengths over the size."""
+    """Return the largest difference (n,) of poses and joints of states (1, n | 1), per size."""
     largest = np.zeros(b.T.shape[1])
     for T, other in zip((a.T, *a.others), (b.T, *b.others), strict=True):
         gap = (T - other)[0]

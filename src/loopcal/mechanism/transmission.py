@@ -87,7 +87,7 @@ MOVABLE = 8
 
 
 def compute_angle(length: FloatArray, triangle: FloatArray) -> FloatArray:
-    """Return the joint angle [rad] at a length (..) [m] of triangles (.., 10), NaN without."""
+    """Return the joint angle [rad] at a length (..) [m] of triangles (.., 10), NaN out of reach."""
     level, reach, gamma = describe_triangle(triangle)
     side, middle = triangle[..., 8], triangle[..., 9]
     with np.errstate(invalid="ignore"):
@@ -627,7 +627,7 @@ def count_readings(constants: FloatArray) -> int:
 def split_readings(
     q: FloatArray, constants: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return reading, direction of approach and load of each row (.., a), 0 without."""
+    """Return the reading, direction of approach and load of each row (.., a), 0 if not given."""
     numbers = constants[:, SOURCE : LOADED + 1 : 2].astype(int)
     a, source = int(numbers.max(initial=-1)) + 1, numbers[:, 0]
     parts = q[..., :a], q[..., a:] if q.shape[-1] == 2 * a else np.zeros_like(q[..., :a])

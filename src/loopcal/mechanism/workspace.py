@@ -72,7 +72,7 @@ def evaluate_limits(
 def check_limits(
     robot: Mechanism, values: FloatArray, q: FloatArray, state: State
 ) -> tuple[BoolArray, NDArray[np.object_]]:
-    """Return which rows keep all limits (t, n), and the finding of the first exceeded one."""
+    """Return which rows keep all limits (t, n), and the finding of the first exceeded, or None."""
     allowed, findings = np.ones(state.status.shape, bool), np.full(state.status.shape, None)
     for limit in evaluate_limits(robot, values, q, state):
         # a bound itself is allowed, up to the rounding of its own number
@@ -288,7 +288,7 @@ def draw_coordinates(
 def find_reachable(
     robot: Mechanism, coordinates: FloatArray, rejected: Counter[str]
 ) -> tuple[BoolArray, Solution]:
-    """Return which rows the machine reaches (n,), and all of them solved; count the reasons."""
+    """Return which rows the machine reaches (n,), and all solved; count reasons of the others."""
     values, solution = robot.values[None], inverse(robot, coordinates)
     good = np.array(solution.closed)
     rejected["the loops cannot be closed"] += int((~good).sum())

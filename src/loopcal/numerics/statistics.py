@@ -366,7 +366,7 @@ def compute_quantiles(values: FloatArray, shares: Sequence[float]) -> FloatArray
 
 
 def compute_known_median(values: FloatArray, axis: int) -> FloatArray:
-    """Return medians along an axis without NaN, as `np.nanmedian`; NaN without numbers."""
+    """Return medians along an axis of what is not NaN, as `np.nanmedian`; NaN without any."""
     ordered = np.sort(values, axis=axis)  # NaN come last
     count = (~np.isnan(ordered)).sum(axis=axis, keepdims=True)
     middle = np.concatenate([np.maximum(count - 1, 0) // 2, count // 2], axis=axis)

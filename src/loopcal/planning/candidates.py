@@ -126,7 +126,7 @@ def list_steps(robot: Mechanism, dimensions: Sequence[Dimension], digits: int) -
 def round_coordinates(
     robot: Mechanism, coordinates: FloatArray, towards: FloatArray | None = None
 ) -> FloatArray:
-    """Round coordinates (n, c) to steps of DIGITS, towards a place (c,)."""
+    """Round coordinates (n, c) to steps of DIGITS; all are rounded `towards` a place (c,)."""
     steps = list_steps(robot, list_dimensions(robot.controlled), DIGITS)
     counts = coordinates / steps
     if towards is None:

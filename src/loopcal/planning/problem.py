@@ -374,7 +374,7 @@ def _require_plain_sensors(instrument: Instrument) -> None:
 
 
 def _fold_measured(free: FreeParameters, measured: Measurements) -> tuple[FloatArray, int]:
-    """Return the factor (p, p) of earlier measurements, and the equations left for the robot."""
+    """Return the factor (p, p) of earlier measurements, and how many equations the robot gets."""
     robot = free.robot
     check_actuators(measured, robot)
     if not any(rows.is_measured.any() for rows in measured.observations):

@@ -474,7 +474,7 @@ def view_posterior(sample: PosteriorSample, intervals: Intervals | None = None) 
 def _view_draws(
     drawn: str, result: Bootstrap | PosteriorSample, intervals: Intervals
 ) -> list[Block]:
-    """Return draws, findings, and intervals beside the linear ones, in units of the file."""
+    """Return draws, findings, intervals beside linear ones, in units of the robot's file."""
     fit, level = result.fit, intervals.level
     factor, symbols = fit.free_parameters.display()
     lower, upper, half, estimates, stated = (

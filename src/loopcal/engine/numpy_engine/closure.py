@@ -29,7 +29,7 @@ from loopcal.engine.program import (
 from loopcal.typing import FloatArray
 
 CHUNK = 5120
-"""Rows computed together: few for the cache, many enough that Python's share is small."""
+"""Rows computed together: few enough for the cache, and enough that Python costs little."""
 
 
 def linearize(

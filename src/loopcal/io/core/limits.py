@@ -59,7 +59,7 @@ class FileLimit:
     def make_error(
         self, what: str, path: str | Path, count: float | None = None, line: int | None = None
     ) -> FileError:
-        """Return the error for a file beyond this limit; `count` is None if it was not counted."""
+        """Return the error for a file beyond this limit; `count` is None where it is unknown."""
         finding = report_finding(
             "files.limit-exceeded",
             what=what,

@@ -166,7 +166,7 @@ def list_movable(robot: Mechanism) -> list[int]:
 def _list_effects(
     robot: Mechanism, tables: _Tables, parameter: int
 ) -> list[tuple[str, int, int, float]]:
-    """Return what a parameter moves, with factors; nothing where it cannot be changed."""
+    """Return what a parameter moves, with factors; nothing where a part cannot be changed."""
     effects = []
     for stage, moved in zip(robot.blocks, tables.slots, strict=True):
         column = parameter - stage.parameters.start

@@ -809,7 +809,7 @@ def _check_table(placed: PlacedDrive) -> None:
 
 
 def drive_errors(placed: PlacedDrive) -> ErrorModel:
-    """Return the unknown terms of a drive, `q1.offset` and so on; refuse impossible ones."""
+    """Return the unknown terms of a drive, `q1.offset` ..; MechanismError for impossible ones."""
     drive, name, known = placed.drive, placed.own.name, placed.list_terms()
     errors = [weight_errors(name, drive, placed.weights, tuple(known))]
     if isinstance(drive, TriangleDrive):

@@ -154,7 +154,7 @@ def place_limb_with_ball(
 
 
 def frame_from_axis(axis: FloatArray, owner: str) -> FloatArray:
-    """Return a rotation (3, 3) whose third column is along `axis`; x, y, z permute the axes."""
+    """Return a rotation (3, 3), third column along `axis`; x, y, z permute axes cyclically."""
     length = float(np.linalg.norm(axis))
     if not length > 0:
         raise MechanismError(f"{owner} has the axis [0, 0, 0]. Give a direction")
@@ -177,7 +177,7 @@ def map_displacement(
 def map_direction(
     parameter: str, limb: PlacedLimb, element: str, direction: FloatArray, *, turns: bool
 ) -> tuple[LinearMap, ...]:
-    """Map a parameter onto a rotation about (or shift along) `direction` of the carried frame."""
+    """Map a parameter onto a turn about (or shift along) `direction` (3,) of a carried frame."""
     components = limb.rotations[element].T @ direction
     axes = AXES[:3] if turns else AXES[3:]
     # what is below rounding of a direction is no component

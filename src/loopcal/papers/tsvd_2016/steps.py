@@ -163,7 +163,7 @@ def load_design(name: str) -> Design:
 
 
 def adapt_design(case: StudyCase) -> Design:
-    """Return another robot with poses and errors of its study file; DataError without errors."""
+    """Return another robot with poses and errors of its study file; DataError if it has none."""
     study, robot = case.load_study(), case.robot
     assert robot is not None
     content = describe_cell(study, study.cells[0])

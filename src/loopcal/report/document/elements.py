@@ -241,7 +241,7 @@ class CalibrationRecord:
 
     @property
     def fitted_labels(self) -> tuple[str, ...]:
-        """Labels of fitted poses, without excluded ones; none for runs of older versions."""
+        """Labels of fitted poses, without those excluded by options; none for older runs."""
         labels = self.arrays.get("poses")
         excluded = self.result["fit"].get("dropped") or ()
         return () if labels is None else tuple(n for n in labels.tolist() if n not in excluded)

@@ -90,7 +90,7 @@ def draw_robot(robot: Mechanism) -> Figure:
 
 
 def choose_view(robot: Mechanism) -> tuple[int, int]:
-    """Return the axes of the second view: x and y, or of the upright plane of all limbs."""
+    """Return the axes of the second view: x and y, or of the upright plane that holds all limbs."""
     parts = list_parts(robot, robot.home_state)
     points = np.concatenate([part.points[0] for part in parts if part.role in ("limb", "rod")])
     extent = np.ptp(points, axis=0)

@@ -464,7 +464,7 @@ def _refuse_others(path: Path, connection: sqlite3.Connection) -> None:
 
 
 FULL = {sqlite3.SQLITE_FULL, sqlite3.SQLITE_IOERR}
-"""Errors of a disk that takes no more; to SQLite a file that must not grow is one, too."""
+"""Errors of a full disk; SQLite calls a file that must not grow an error of input and output."""
 UNREADABLE = {
     *(sqlite3.SQLITE_NOTADB, sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_SCHEMA),
     *(sqlite3.SQLITE_TOOBIG, sqlite3.SQLITE_MISMATCH),

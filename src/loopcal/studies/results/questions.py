@@ -91,7 +91,7 @@ class Answer:
 
 @dataclass(frozen=True)
 class AnsweredQuestion:
-    """A question with its answers; `name` in the study file, `limit` in SI, unit of the score."""
+    """A question with answers; `name` in the file, `limit` in SI, `score_unit` of its score."""
 
     name: str
     question: Question
@@ -336,7 +336,7 @@ def view_summary(study: Study, summary: StudySummary, shown: Sequence[str]) -> l
 
 
 def explain_failures(counts: Mapping[str, int], trials: int) -> list[Block]:
-    """Return a line for each code of trials (code -> trials): what it means, what to do."""
+    """Return a line for each code of failed trials (code -> trials): what it means, what to do."""
     unfinished = {OUTCOMES[STEPS_REMAIN]: "Trials at their limit of steps"}
     return [
         f"{unfinished.get(code, 'Failed trials')}: {count} of {trials}. {report_finding(code)} "
