@@ -468,7 +468,7 @@ SHEET_COLUMNS = ("step", "role", "hold", "tolerance")
 
 
 def find_column_fault(name: str, what: str) -> Finding | None:
-    """Return why no actuator or measured column can have a name; None where one can."""
+    """Return why no actuator or measured column may be named so; None where one may."""
     if "[" in name or "]" in name or name != name.strip():
         return report_finding("files.name-not-a-column", what=what, name=name)
     is_taken = name in (*ROLES, *SHEET_COLUMNS) or find_open_column(name) is not None

@@ -159,7 +159,7 @@ class TargetKind(Kind):
         return self.split_columns(predicted.reshape(flat), rows.reshape(*flat, rows.shape[-1]))
 
     def locate_targets(self, T: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return targets x (.., k, 3) in the frame and their derivative, at poses T (.., 4, 4)."""
+        """Return targets x (.., k, 3) in the frame, and derivatives (.., k, 3, 6 + u), at poses."""
         k = len(self.targets)
         of_frame, places = (self.item_values(values, name) for name in ("frame", "targets"))
         frame = setup.place_frame(self.T_base_frame, of_frame)

@@ -449,7 +449,7 @@ class RatioTolerance:
 def standard_deviation(
     tolerance: LengthTolerance | AngleTolerance | RatioTolerance | None, name: str
 ) -> float | None:
-    """Return the standard deviation of a tolerance [SI], None without; or MechanismError."""
+    """Return the standard deviation of a tolerance [SI], None without; MechanismError if wrong."""
     if tolerance is None:
         return None
     if (tolerance.sd is None) == (tolerance.limits is None):
