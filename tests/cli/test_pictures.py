@@ -2,8 +2,19 @@
 """The commands `loopcal board` and `loopcal photos`."""
 
 import sys
+from pathlib import Path
 
-from loopcal.io.board import read_board
+import numpy as np
+import pytest
+from PIL import Image
+
+import loopcal as lc
+from loopcal.geometry import exp_so3, make_pose
+from loopcal.io.board import choose_board, format_board, read_board
+from loopcal.measure.kinds.image import Image as ImageKind
+from tests.io.boards import render
+
+LENS = np.array([1000.0, 1003.0, 405.0, 297.0, 0.05, -0.1, 0.0, 0.0, 0.0])
 
 
 def test_without_opencv_the_extra_is_named(loopcal, tmp_path, monkeypatch) -> None:
@@ -19,3 +30,71 @@ def test_command_writes_the_file_and_both_drawings(loopcal, tmp_path) -> None:
     assert read_board(tmp_path / "b.yaml").corners == (7, 5)
     loopcal("board -o b.yaml", "--force", code=1)
     loopcal("board -o b.csv", ".yaml", code=1)
+
+
+@pytest.fixture(scope="module")
+def photographed(tmp_path_factory) -> Path:
+    """Return a folder with a board on the platform of a hexapod, and pictures of it."""
+    folder = tmp_path_factory.mktemp("photographed")
+    robot, rng = lc.load_robot("hexapod-42"), np.random.default_rng(3)
+    board = choose_board(6, 5, 0.012)
+    text = format_board(board).replace("# measured", "measured")
+    (folder / "board.yaml").write_text(text)
+    T_camera = make_pose(exp_so3(np.array([0.05, 3.08, 0.1])), np.array([-0.01, 0.02, 0.43]))
+    T_board = make_pose(exp_so3(np.array([np.pi, 0.0, 0.0])), np.array([-0.024, 0.018, 0.01]))
+    (folder / "pictures").mkdir()
+    coordinates = rng.uniform(-1.0, 1.0, (9, 6)) * [0.02, 0.02, 0.015, 0.2, 0.2, 0.2]
+    coordinates[:, 2] += 0.2
+    solution = lc.inverse(robot, coordinates)
+    lines = ["pose," + ",".join(f"{actuator.name} [mm]" for actuator in robot.actuators)]
+    for i, (T, q) in enumerate(zip(solution.T, solution.q, strict=True)):
+        seen = np.linalg.inv(T_camera) @ T @ T_board
+        picture = render(board, seen, LENS, (800, 600), seed=i)
+        Image.fromarray(picture if i else picture // 32 + 90).save(
+            folder / "pictures" / f"p{i}.png"
+        )
+        lines.append(",".join([f"p{i}", *(f"{1e3 * x:.6f}" for x in q)]))
+    (folder / "poses.csv").write_text("\n".join(lines) + "\n")
+    return folder
+
+
+@pytest.mark.slow
+def test_photos_become_a_measurement_file_that_calibrates(
+    photographed, loopcal, monkeypatch
+) -> None:
+    monkeypatch.chdir(photographed)
+    words = "photos pictures --board board.yaml --poses poses.csv -o points.csv"
+    printed = loopcal(words, "p0.png: left out: it shows 0 corners", "blur 0.9 px")
+    assert "points.csv: 8 of 9 pictures" in printed.out
+    robot = lc.load_robot("hexapod-42")
+    data = lc.load_measurements("points.csv", robot)
+    (rows,) = data.observations
+    assert isinstance(rows.kind, ImageKind)
+    assert rows.kind.corners == (5, 4)
+    page = Path("points.html").read_text("utf-8")
+    assert page.count("data:image/jpeg") == 9
+    loopcal("calibrate hexapod-42 points.csv -o run", code=(0, 2))
+    fit = lc.load_run("run").result["fit"]
+    assert fit["chi_square"] / fit["degrees"] < 1.0  # corners are better than the assumed 0.1 px
+    loopcal(words, "--force", code=1)
+    found = loopcal(f"{words} --force --json --workers 1").json
+    assert [entry["pose"] for entry in found["pictures"]] == [f"p{i}" for i in range(9)]
+    assert found["used"] == 8
+    assert found["pictures"][0]["fault"]["code"] == "pictures.few-corners"
+
+
+def test_photos_without_any_board_are_refused_with_the_reason(loopcal, tmp_path) -> None:
+    loopcal("board -o board.yaml")
+    (tmp_path / "pictures").mkdir()
+    loopcal("photos pictures --board board.yaml -o points.csv", "no pictures", code=1)
+    Image.fromarray(np.full((60, 80), 90, dtype=np.uint8)).save(tmp_path / "pictures" / "a.png")
+    words = "photos pictures --board board.yaml -o points.csv"
+    loopcal(words, "The first one, a.png, has this fault: it shows 0 corners", code=1)
+    assert not (tmp_path / "points.csv").exists()
+
+
+def test_photos_without_opencv_name_the_extra(loopcal, tmp_path, monkeypatch) -> None:
+    loopcal("board -o board.yaml")
+    (tmp_path / "a.jpg").write_bytes(b"")
+    monkeypatch.setitem(sys.modules, "cv2", None)
+    loopcal("photos . --board board.yaml -o points.csv", "pip install 'loopcal[camera]'", code=1)

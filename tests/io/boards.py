@@ -2,6 +2,7 @@
 """OpenCV's own boards, and pictures of them by a camera of our own."""
 
 import cv2
+import numpy as np
 
 from loopcal.io.board import Board
 
@@ -11,3 +12,69 @@ def make_charuco(board: Board) -> cv2.aruco.CharucoBoard:
     number = getattr(cv2.aruco, f"DICT_{board.dictionary}")
     dictionary = cv2.aruco.getPredefinedDictionary(number)
     return cv2.aruco.CharucoBoard(board.squares, board.square, board.marker, dictionary)
+
+
+def render(
+    board: Board,
+    T_camera_board: np.ndarray,
+    lens: np.ndarray,
+    size: tuple[int, int],
+    blur: float = 0.7,
+    noise: float = 2.0,
+    seed: int = 1,
+) -> np.ndarray:
+    """Return a picture (height, width) of a board in front of a gray wall, by rays of our own.
+
+    lens : fx, fy, cx, cy, k1, k2, k3, p1, p2. blur : of a Gaussian [px]. noise : of gray values.
+    A pixel is the mean of 3 x 3 rays. The edges of the picture are darker (vignetting).
+    """
+    fine, scale = 3, 8000.0  # rays a pixel side, texture pixels per meter
+    width, height = (round(n * board.square * scale) for n in board.squares)
+    texture = make_charuco(board).generateImage((width, height))
+    fx, fy, cx, cy, k1, k2, k3, p1, p2 = lens
+    u = (np.arange(size[0] * fine) + 0.5) / fine - 0.5
+    v = (np.arange(size[1] * fine) + 0.5) / fine - 0.5
+    x, y = np.meshgrid((u - cx) / fx, (v - cy) / fy)
+    seen_x, seen_y = x, y
+    for _ in range(6):  # the distortion is inverted by a fixed-point iteration
+        r = x * x + y * y
+        radial = 1.0 + r * (k1 + r * (k2 + r * k3))
+        dx = 2.0 * p1 * x * y + p2 * (r + 2.0 * x * x)
+        dy = p1 * (r + 2.0 * y * y) + 2.0 * p2 * x * y
+        x, y = (seen_x - dx) / radial, (seen_y - dy) / radial
+    R, t = T_camera_board[:3, :3], T_camera_board[:3, 3]
+    rays = np.stack([x, y, np.ones_like(x)], axis=-1)
+    depth = (R[:, 2] @ t) / (rays @ R[:, 2])
+    p = (rays * depth[..., None] - t) @ R  # on the board, from corner 0
+    column, row = (((p[..., k] + board.square) * scale).astype(np.float32) for k in (0, 1))
+    margin = board.square * scale  # white paper around the squares
+    paper = (column > -margin) & (column < width + margin)
+    paper &= (row > -margin) & (row < height + margin)
+    # linear between the middles of texels, or edges along rows of rays jump by a ray
+    place = column - np.float32(0.5), row - np.float32(0.5)
+    values = cv2.remap(
+        texture, *place, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=255
+    )
+    values = np.where(paper, 30.0 + 0.75 * values, 110.0)
+    if blur > 0.0:
+        values = cv2.GaussianBlur(values, (0, 0), blur * fine)
+    picture = values.reshape(size[1], fine, size[0], fine).mean(axis=(1, 3))
+    r = np.hypot(*np.meshgrid(np.linspace(-1, 1, size[0]), np.linspace(-1, 1, size[1])))
+    picture = picture * (1.0 - 0.15 * r * r)
+    picture = picture + noise * np.random.default_rng(seed).normal(size=picture.shape)
+    return np.clip(np.round(picture), 0, 255).astype(np.uint8)
+
+
+def project_corners(board: Board, T_camera_board: np.ndarray, lens: np.ndarray) -> np.ndarray:
+    """Return the true pixels (corners, 2), by the formulas of OpenCV's documentation."""
+    fx, fy, cx, cy, k1, k2, k3, p1, p2 = lens
+    columns, rows = board.corners
+    number = np.arange(columns * rows)
+    place = np.stack([number % columns, number // columns, 0 * number], axis=1) * board.square
+    c = place @ T_camera_board[:3, :3].T + T_camera_board[:3, 3]
+    x, y = c[:, 0] / c[:, 2], c[:, 1] / c[:, 2]
+    r = x * x + y * y
+    radial = 1.0 + r * (k1 + r * (k2 + r * k3))
+    u = x * radial + 2.0 * p1 * x * y + p2 * (r + 2.0 * x * x)
+    v = y * radial + p1 * (r + 2.0 * y * y) + 2.0 * p2 * x * y
+    return np.stack([fx * u + cx, fy * v + cy], axis=1)

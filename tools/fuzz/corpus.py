@@ -258,6 +258,7 @@ def _list_lines(recipe: Recipe) -> Iterator[Line]:
         0.3 plan robot.yaml -o plan {few} --allowed targets.csv --force
         0.5 gcode robot.yaml plan -o out.ngc
         0.1 board -o board.yaml
+        0.1 photos plan --board board.yaml -o out.csv
         2 export run -o out.json
         1 export run -o out.csv
         1 export run/robot.yaml -o out.json

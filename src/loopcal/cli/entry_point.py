@@ -48,6 +48,7 @@ SECTIONS = {
         "gcode": ("exchange", "Write a program that moves a machine to the poses of a plan."),
         "fill": ("exchange", "Fill in the sheet of a plan from the export of an instrument."),
         "board": ("picture", "Draw a board to print, for pictures by a phone or camera."),
+        "photos": ("picture", "Find the corners of a printed board in pictures."),
         "simulate": ("measurement", "Write a measurement file of a simulated machine."),
     },
     "Calibrate": {

@@ -43,6 +43,7 @@ FILES: Mapping[str, tuple[str, ...]] = {
     "studies": ("study",),
     "plan": ("plan",),
     "sheets": ("sheet",),
+    "pictures": ("pictures",),
     "study_folders": ("store", "workers"),
     "engine": ("engine",),
     "files": ("files",),

@@ -1,0 +1,361 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pictures of a printed board: corners found by OpenCV, poses by name, and the measurement file."""
+
+from __future__ import annotations
+
+import base64
+import re
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from loopcal.environment import import_optional
+from loopcal.errors import DataError, FileError
+from loopcal.findings import Finding, report_finding
+from loopcal.frozen_dataclass import dataclass, field, replace
+from loopcal.io.board import Board, load_dictionary
+from loopcal.io.core.csv_table import format_row, read_table
+from loopcal.io.core.limits import make_name
+from loopcal.io.core.yaml_file import format_flow
+from loopcal.typing import FloatArray, IntArray
+
+ENDINGS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".heic", ".heif", ".dng")
+"""Endings of files that are taken for pictures, also of those that cannot be read."""
+LEAST_CORNERS = 8
+"""Corners below which a picture is left out: two more than determine a pose well."""
+BLUR = 3.0
+"""Standard deviation of the blur of edges [px] from which a picture is left out."""
+REDUCED = (2, 4)
+"""Times that a picture is reduced to see whether only blur hides the board."""
+THUMBNAIL = 480
+"""Width of a picture on the contact sheet [px]."""
+FULL_FRAME = 43.2666
+"""Diagonal of the film that focal lengths of phones refer to [mm]."""
+SAME_FOCAL = 0.01
+"""Difference of focal lengths, as a share, from which a picture is of another zoom."""
+
+
+@dataclass(frozen=True)
+class PictureTask:
+    """A picture to examine, which a worker process can be given."""
+
+    path: Path
+    board: Board
+    most_blur: float = BLUR
+    least_corners: int = LEAST_CORNERS
+
+    @property
+    def key(self) -> str:
+        """The path."""
+        return str(self.path)
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """What a picture shows.
+
+    Parameters
+    ----------
+    path : the file. size : width and height. focal : focal length by EXIF [px]; None without.
+    corners : (n,) numbers. pixels : (n, 2), pixel (0, 0) being the middle of the first one.
+    blur : standard deviation of the blur of edges [px], in the worse direction; NaN if unknown.
+    fault : why it is left out. thumbnail : JPEG with the corners.
+    """
+
+    path: Path
+    size: tuple[int, int] = (0, 0)
+    focal: float | None = None
+    corners: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.intp))
+    pixels: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
+    blur: float = float("nan")
+    fault: Finding | None = None
+    thumbnail: bytes = field(default=b"", repr=False)
+
+
+def list_pictures(folder: Path) -> tuple[Path, ...]:
+    """Return the pictures of a folder in the order of their names, IMG_9 before IMG_10."""
+    if not folder.is_dir():
+        raise FileError("this folder does not exist. Name the folder with the pictures", folder)
+    found = [path for path in folder.iterdir() if path.suffix.lower() in ENDINGS]
+    if not found:
+        raise FileError(f"this folder has no pictures ({', '.join(ENDINGS)})", folder)
+
+    def order(path: Path) -> list[tuple[int, str]]:
+        return [(int(p) if p.isdigit() else -1, p) for p in re.split(r"(\d+)", path.name.lower())]
+
+    return tuple(sorted(found, key=order))
+
+
+def examine_picture(task: PictureTask) -> Picture:
+    """Return the corners of a picture, or why it is left out."""
+    cv2 = import_optional("cv2", "camera")
+    try:
+        gray, focal = _load_picture(task.path)
+    except (OSError, ValueError, SyntaxError, MemoryError) as error:  # what Pillow raises
+        reason = " ".join(str(error).split()) or type(error).__name__
+        reason = reason.replace(repr(str(task.path)), "it")[:120]
+        return Picture(task.path, fault=report_finding("pictures.unreadable", reason=reason))
+    size = gray.shape[1], gray.shape[0]
+    corners, pixels = find_corners(cv2, gray, task.board)
+    blur = measure_blur(cv2, gray, task.board, corners, pixels)
+    least, fault = min(task.least_corners, task.board.corners[0] * task.board.corners[1]), None
+    if len(corners) < least:
+        flipped = np.ascontiguousarray(gray[:, ::-1])
+        if len(find_corners(cv2, flipped, task.board)[0]) >= least:
+            fault = report_finding("pictures.mirrored")
+        elif _shows_reduced(cv2, gray, task.board, len(corners)):
+            fault = report_finding("pictures.blurred", blur=None, limit=task.most_blur)
+        else:
+            fault = report_finding("pictures.few-corners", found=len(corners), least=least)
+    elif blur > task.most_blur:
+        fault = report_finding("pictures.blurred", blur=round(blur, 1), limit=task.most_blur)
+    thumbnail = _draw_thumbnail(cv2, gray, pixels)
+    return Picture(task.path, size, focal, corners, pixels, blur, fault, thumbnail)
+
+
+def _shows_reduced(cv2: Any, gray: Any, board: Board, count: int) -> bool:
+    """Return whether a reduced picture, in which blur is less, shows more corners than `count`."""
+    for factor in REDUCED:
+        size = gray.shape[1] // factor, gray.shape[0] // factor
+        small = cv2.resize(gray, size, interpolation=cv2.INTER_AREA) if min(size) else gray
+        if len(find_corners(cv2, small, board)[0]) > count:
+            return True
+    return False
+
+
+def _load_picture(path: Path) -> tuple[np.ndarray[Any, np.dtype[np.uint8]], float | None]:
+    """Return the gray values of the sensor, as it was held, and the focal length by EXIF [px]."""
+    from PIL import Image, UnidentifiedImageError
+
+    try:
+        with Image.open(path) as picture:
+            details = picture.getexif().get_ifd(0x8769)
+            film = float(details.get(0xA405) or 0.0)  # FocalLengthIn35mmFilm
+            gray = np.asarray(picture.convert("L"))
+    except UnidentifiedImageError as error:
+        raise ValueError("its format is unknown") from error
+    except Image.DecompressionBombError as error:
+        raise ValueError(str(error)) from error
+    focal = film / FULL_FRAME * float(np.hypot(*gray.shape))
+    return gray, focal if focal > 0.0 and np.isfinite(focal) else None
+
+
+def find_corners(cv2: Any, gray: Any, board: Board) -> tuple[IntArray, FloatArray]:
+    """Return numbers (n,) and pixels (n, 2) of the inner corners of a board."""
+    dictionary = load_dictionary(cv2, board)
+    layout = cv2.aruco.CharucoBoard(board.squares, board.square, board.marker, dictionary)
+    pixels, corners, _, _ = cv2.aruco.CharucoDetector(layout).detectBoard(gray)
+    if corners is None or len(corners) == 0:
+        return np.zeros(0, dtype=np.intp), np.zeros((0, 2))
+    corners, pixels = corners.ravel().astype(np.intp), pixels.reshape(-1, 2).astype(float)
+    # once more in a window without the markers; blurred, because steps between pixels mislead
+    step = measure_spacing(board, corners, pixels)
+    if np.isfinite(step):
+        window = int(np.clip(0.1 * step, 2, 20))
+        criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-3)
+        smooth = cv2.GaussianBlur(gray.astype(np.float32), (0, 0), 1.0)
+        start = pixels.astype(np.float32).reshape(-1, 1, 2)
+        found = cv2.cornerSubPix(smooth, start, (window, window), (-1, -1), criteria)
+        pixels = found.reshape(-1, 2).astype(float)
+    return corners, pixels
+
+
+def _pair_neighbors(board: Board, corners: IntArray) -> list[tuple[IntArray, IntArray]]:
+    """Return the places in `corners` of neighbors along a row, and of those along a column."""
+    columns, rows = board.corners
+    place = np.full(columns * rows, -1)
+    place[corners] = np.arange(len(corners))
+    grid = place.reshape(rows, columns)
+    pairs = ((grid[:, :-1], grid[:, 1:]), (grid[:-1], grid[1:]))
+    found = [(a.ravel(), b.ravel()) for a, b in pairs]
+    return [(a[(a >= 0) & (b >= 0)], b[(a >= 0) & (b >= 0)]) for a, b in found]
+
+
+def measure_spacing(board: Board, corners: IntArray, pixels: FloatArray) -> float:
+    """Return the smallest distance of neighboring corners [px]; NaN without neighbors."""
+    pairs = _pair_neighbors(board, corners)
+    gaps = np.concatenate([np.linalg.norm(pixels[b] - pixels[a], axis=1) for a, b in pairs])
+    return float(gaps.min()) if len(gaps) else float("nan")
+
+
+def measure_blur(cv2: Any, gray: Any, board: Board, corners: IntArray, pixels: FloatArray) -> float:
+    """Return the standard deviation of the blur [px] of edges between neighboring corners, along
+    rows or along columns, whichever is larger; NaN without neighbors.
+
+    A step of height h that a Gaussian blurs has the slope `h / (sigma sqrt(2 pi))`.
+    """
+    found = []
+    for a, b in _pair_neighbors(board, corners):
+        if not len(a):
+            continue
+        along = pixels[b] - pixels[a]
+        length = np.linalg.norm(along, axis=1)
+        across = np.stack([-along[:, 1], along[:, 0]], axis=1) / length[:, None]
+        reach = float(np.clip(0.12 * np.median(length), 3.0, 30.0))
+        steps = np.linspace(-reach, reach, 61)
+        # the mean of several profiles, away from the corners, against noise
+        shares = np.linspace(0.25, 0.75, 9)
+        middle = pixels[a][:, None] + shares[:, None] * along[:, None]
+        points = middle[:, :, None] + steps[:, None] * across[:, None, None]
+        flat = points.reshape(len(a), -1, 2).astype(np.float32)
+        values = cv2.remap(gray, flat[..., 0], flat[..., 1], cv2.INTER_LINEAR).astype(float)
+        profile = values.reshape(len(a), len(shares), len(steps)).mean(axis=1)
+        height = np.ptp(profile, axis=1)
+        slope = np.abs(np.gradient(profile, steps, axis=1)).max(axis=1)
+        sigma = height / np.maximum(slope, 1e-9) / np.sqrt(2.0 * np.pi)
+        found.append(float(np.median(sigma)))
+    return max(found, default=float("nan"))
+
+
+def _draw_thumbnail(cv2: Any, gray: Any, pixels: FloatArray) -> bytes:
+    """Return a small JPEG with rings around the corners."""
+    scale = min(1.0, THUMBNAIL / gray.shape[1])
+    size = max(1, round(scale * gray.shape[1])), max(1, round(scale * gray.shape[0]))
+    small = cv2.cvtColor(cv2.resize(gray, size, interpolation=cv2.INTER_AREA), cv2.COLOR_GRAY2BGR)
+    for u, v in scale * pixels:
+        cv2.circle(small, (round(u), round(v)), 4, (0, 90, 230), 1, cv2.LINE_AA)
+    return cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, 75])[1].tobytes()
+
+
+def compare_pictures(pictures: Sequence[Picture]) -> tuple[Picture, ...]:
+    """Return pictures, without those of another size or focal length than most have."""
+    good = [picture for picture in pictures if picture.fault is None]
+    if not good:
+        return tuple(pictures)
+    size = Counter(picture.size for picture in good).most_common(1)[0][0]
+    focals = [p.focal for p in good if p.focal is not None and p.size == size]
+    focal = float(np.median(focals)) if focals else None
+    checked = []
+    for picture in pictures:
+        fault = picture.fault
+        if fault is None and picture.size != size:
+            sizes = [f"{width} x {height}" for width, height in (picture.size, size)]
+            fault = report_finding("pictures.other-size", size=sizes[0], other=sizes[1])
+        elif fault is None and focal is not None:
+            own = picture.focal or focal
+            if abs(own / focal - 1.0) > SAME_FOCAL:
+                numbers = round(own), round(focal)
+                fault = report_finding("pictures.zoomed", focal=numbers[0], other=numbers[1])
+        checked.append(replace(picture, fault=fault))
+    return tuple(checked)
+
+
+def name_poses(paths: Sequence[Path], names: Path | None = None) -> dict[Path, str]:
+    """Return the pose of each picture: its file name without ending, or by a table of poses.
+
+    A table with the column `picture` assigns names of files. Otherwise the pictures have the names
+    of its poses, or are as many as its poses and in their order.
+
+    Raises
+    ------
+    FileError : the table does not fit the pictures.
+    """
+    if names is None:
+        stems = Counter(path.stem for path in paths)
+        if double := [stem for stem, times in stems.items() if times > 1]:
+            raise DataError(f"two pictures have the name {double[0]!r}. Rename one of them")
+        return {path: make_name(path.stem) for path in paths}
+    table = read_table(names)
+    poses = table.pose_names()
+    if "picture" in table.names:
+        listed = dict(zip(table.text("picture"), poses, strict=True))
+        missing = [path.name for path in paths if not {path.name, path.stem} & listed.keys()]
+        if missing:
+            raise FileError(f"the column 'picture' lacks {missing[0]!r}. Add it", names)
+        return {path: listed.get(path.name) or listed[path.stem] for path in paths}
+    unique = list(dict.fromkeys(poses))
+    if all(path.stem in unique for path in paths):
+        return {path: path.stem for path in paths}
+    if len(unique) != len(paths):
+        sentence = (
+            f"there are {len(paths)} pictures, but {len(unique)} poses, so their order assigns "
+            "none. Name the pictures like the poses, or add the column 'picture'"
+        )
+        raise FileError(sentence, names)
+    return dict(zip(paths, unique, strict=True))
+
+
+def refer_to_poses(poses: Path | None, output: Path) -> dict[str, str]:
+    """Return the setting by which a measurement file names a table with readings beside it."""
+    if poses is None or poses.resolve().parent != output.resolve().parent:
+        return {}
+    has_readings = any(unit is not None for unit in read_table(poses).units.values())
+    return {"poses": poses.name} if has_readings else {}
+
+
+def format_pictures(
+    board: Board,
+    pictures: Sequence[Picture],
+    names: Mapping[Path, str],
+    settings: Mapping[str, Any],
+) -> str:
+    """Return the measurement file of the pictures without a fault; `settings` as the kind `image`
+    has them, such as mount and noise.
+    """
+    good = [picture for picture in pictures if picture.fault is None]
+    if not good:
+        name, reason = pictures[0].path.name, str(pictures[0].fault)
+        raise DataError(
+            report_finding("pictures.none", count=len(pictures), name=name, reason=reason)
+        )
+    focals = [picture.focal for picture in good if picture.focal is not None]
+    known: dict[str, Any] = {"kind": "image", **settings}
+    known |= {"corners": board.corners, "square": f"{1e3 * board.square:g} mm"}
+    known |= {"size": good[0].size}
+    if focals:
+        known["focal"] = [f"{float(np.median(focals)):.0f} px"] * 2
+    known["unknown"] = ["camera", "board", "focal", "center", "radial", "print"]
+    width = max(good[0].size)
+    values: dict[str, Any] = {"camera.c?": {"sd": f"{0.02 * width:.0f} px"}, "camera.k3": "fixed"}
+    if board.measured is None:
+        values["board.scale_?"] = {"sd": 0.02}
+    else:
+        for axis, found, mark in zip("xy", board.measured, board.marks, strict=True):
+            scale = {
+                "start": round(found / mark - 1.0, 9),
+                "sd": round(board.measured_sd / mark, 9),
+            }
+            values[f"board.scale_{axis}"] = scale
+    known["unknowns"] = values
+    lines = [f"# {key}: {format_flow(value)}" for key, value in known.items()]
+    lines.append("pose,corner,u [px],v [px]")
+    for picture in good:
+        for corner, (u, v) in zip(picture.corners, picture.pixels, strict=True):
+            lines.append(format_row((names[picture.path], f"{corner}", f"{u:.3f}", f"{v:.3f}")))
+    return "\n".join(lines) + "\n"
+
+
+def format_contact_sheet(pictures: Sequence[Picture], names: Mapping[Path, str]) -> str:
+    """Return one HTML page of all pictures with their corners."""
+    cards = []
+    for picture in pictures:
+        source = base64.b64encode(picture.thumbnail).decode()
+        image = f'<img alt="" src="data:image/jpeg;base64,{source}">' if source else ""
+        name = escape(f"{picture.path.name}: pose {names[picture.path]}")
+        cards.append(
+            f'<figure class="{"bad" if picture.fault else "good"}">{image}<figcaption><b>{name}</b>'
+            f"<br>{escape(describe_picture(picture))}</figcaption></figure>"
+        )
+    used = sum(picture.fault is None for picture in pictures)
+    return (
+        '<!doctype html><html lang="en"><head><meta charset="utf-8"><title>Pictures</title>'
+        "<style>body{font:15px sans-serif;margin:1rem;color:#222;background:#fff}"
+        "main{display:grid;grid-template-columns:repeat(auto-fill,minmax(18rem,1fr));gap:1rem}"
+        "figure{margin:0;border:2px solid #8a8;padding:.5rem}.bad{border-color:#b22}"
+        "img{width:100%}</style></head><body>"
+        f"<h1>Pictures of the board: {used} of {len(pictures)} are used</h1><main>"
+        + "\n".join(cards)
+        + "</main></body></html>\n"
+    )
+
+
+def describe_picture(picture: Picture) -> str:
+    """Return a line on a picture: what was found, or why it is left out."""
+    if picture.fault is not None:
+        return f"left out: {picture.fault}"
+    blur = "" if np.isnan(picture.blur) else f", blur {picture.blur:.1f} px"
+    return f"{len(picture.corners)} corners{blur}"
