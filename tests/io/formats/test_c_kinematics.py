@@ -6,6 +6,7 @@ import re
 import shutil
 import subprocess
 from pathlib import Path
+from textwrap import indent
 
 import numpy as np
 import pytest
@@ -169,6 +170,19 @@ LEAST_SQUARES = EXECHON.replace("family: limbs", "family: limbs\nclosure: least-
 def test_loops_that_stay_open_agree(text: str, tmp_path: Path) -> None:
     """Readings hold while the gaps are minimized, and lead to the coordinates."""
     robot = draw_machine(load_text(tmp_path, text))
+    assert lc.forward(robot, lc.inverse(robot, robot.home[None]).q).residual[0] > 1e-6
+    assert compile_and_run(export_text(robot), tmp_path).startswith("50 poses, 0 failed")
+
+
+def test_a_stage_after_loops_that_stay_open_is_closed(tmp_path: Path) -> None:
+    """The wrist of a Tricept on the head of an Exechon machine."""
+    shipped = (Path(lc.__file__).parent / "robots" / "tricept.yaml").read_text("utf-8")
+    head, wrist = shipped.split("  - name: head\n    family: limbs\n")
+    keys = EXECHON[EXECHON.index("controlled:") : EXECHON.index("workspace:")]
+    own = "  - name: head\n    family: limbs\n    closure: least-squares\n" + indent(keys, "    ")
+    wrist = wrist[wrist.index("  - name: w1") :]
+    wrist = re.sub(r"^(home|fixed|workspace):.*\n", "", wrist, flags=re.M)
+    robot = draw_machine(load_text(tmp_path, head + own + wrist))
     assert lc.forward(robot, lc.inverse(robot, robot.home[None]).q).residual[0] > 1e-6
     assert compile_and_run(export_text(robot), tmp_path).startswith("50 poses, 0 failed")
 

@@ -84,6 +84,7 @@ class _Limb(NamedTuple):
     row: list[int]
     driven: int
     is_alone: bool
+    is_exact: bool
     length: float
     sigma: float
 
@@ -395,7 +396,8 @@ def _add_limbs(tables: _Tables, robot: Mechanism, e: FloatArray, drives: int) ->
             sigma = 0.0 if program.sigma is None else program.sigma[group.actuator[driven[0], k]]
             head = (group.ending.upper(), on, to, count, link, joint, len(row))
             rows, length = [*row, *[0] * (6 - len(row))], float(placed.length[k, 0])
-            last = (driven[0] if driven else 0, robot.is_serial, length, sigma)
+            is_exact = not program.may_stay_open and program.sigma is None
+            last = (driven[0] if driven else 0, robot.is_serial, is_exact, length, sigma)
             tables.limbs.append(_Limb(*head, rows, *last))
 
 

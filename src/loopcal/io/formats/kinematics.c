@@ -75,7 +75,7 @@ enum { X, Y, Z, PHI, THETA, PSI, ROLL, PITCHING, YAW };
 
 /* A chain of joints from a body (-1 is the base) to another one; the rod is its last joint. */
 struct limb {
-    int ending, on, to, joints, link, joint, rows, row[6], driven, is_alone;
+    int ending, on, to, joints, link, joint, rows, row[6], driven, is_alone, is_exact;
     double length, sigma;
 };
 
@@ -126,7 +126,7 @@ struct stage {
 #define LONG 0.5      /* longest step, relative to the size */
 #define WIDTH (COLUMNS + KINEMATICS_READINGS)
 #define ROWS (CLOSURE_ROWS + SUMS + KINEMATICS_COORDINATES + DRIVES)
-/* Weight of sums and coordinates where other rows do not close: these hold. */
+/* Weight of sums, coordinates and closed stages where other loops stay open: these hold. */
 #define TIGHT (STAYS_OPEN ? 1e5 : 1.0)
 #define SOFT 1e-5     /* weight of short steps of drives that the coordinates do not determine */
 
@@ -474,6 +474,10 @@ static void write_limb(struct equations *e, int number, const kinematics_state *
         for (j = 0; j <= COLUMNS; j++)
             e->row[first][j] /= fabs(slope) * limb->sigma;
     }
+    if (STAYS_OPEN && limb->is_exact)
+        for (n = 0; n < limb->rows; n++)
+            for (j = 0; j <= COLUMNS; j++)
+                e->row[first + n][j] *= TIGHT;
 }
 
 /* Write the base and the platform of each stage in the base of the machine. */
