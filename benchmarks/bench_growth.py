@@ -7,6 +7,7 @@ import csv
 import tempfile
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -108,8 +109,8 @@ def bench_calibration() -> Metric:
     robot = load_robot("linear-delta")
     options = CalibrationOptions(hold_out=0.25)
     data = [_measured(robot, n) for n in (FEW, MANY)]
-    tasks = (lambda d=d: calibrate(robot, d, options) for d in data)
-    return _growth("growth.calibration_of_rows", *tasks)
+    few, many = (partial(calibrate, robot, d, options) for d in data)
+    return _growth("growth.calibration_of_rows", few, many)
 
 
 def bench_compensation() -> Metric:
@@ -117,8 +118,13 @@ def bench_compensation() -> Metric:
     robot = load_robot("linear-delta")
     truth = robot.with_values(sample_truth(robot, 1, 0)[0])
     targets = [_targets(robot, n) for n in (FEW, MANY)]
-    tasks = (lambda x=x: format_compensation(compensate(truth, x)) for x in targets)
-    return _growth("growth.compensation_of_targets", *tasks)
+    few, many = (partial(_write_compensation, truth, x) for x in targets)
+    return _growth("growth.compensation_of_targets", few, many)
+
+
+def _write_compensation(robot: Mechanism, targets: np.ndarray) -> str:
+    """Return the file of compensated targets (n, c)."""
+    return format_compensation(compensate(robot, targets))
 
 
 def bench_sessions() -> Metric:

@@ -68,7 +68,7 @@ def _exchange_by_hand(rows: Array, n: int) -> Array:
     rows = rows / scale
     M, chosen = 1e-6 * np.eye(rows.shape[2]), np.zeros(0, dtype=np.int64)
     for _ in range(n):
-        chosen = np.append(chosen, np.argmax(gain(M)))
+        chosen = np.append(chosen, int(np.argmax(gain(M))))
         M = M + rows[chosen[-1]].T @ rows[chosen[-1]]
     for j in range(n):
         M = M - rows[chosen[j]].T @ rows[chosen[j]]

@@ -147,7 +147,8 @@ def locate(machine: Machine, p: Values, q: Array, start: Array) -> Array:
     """Return the coordinates of the pose at which the loops close, by Newton's method with
     differences.
     """
-    x, step = np.array(start, dtype=float), 1e-6
+    x: Array = np.array(start, dtype=np.float64)
+    step = 1e-6
     for _ in range(30):
         errors = machine.close(p, q, x)
         if np.abs(errors).max() < 1e-14:  # [m]

@@ -3,9 +3,9 @@
 
 Pass marks: 7 matching digits for values and for standard errors, from both official starts, with
 default settings. Lanczos1 needs 2 for standard errors, because its residuals are the rounding of
-its printed data (sum of squares 1.4e-25). Lanczos3 needs 6 for those from its second start:
-standard errors come from the rows before the last step, and a step of 1e-8 of its nearly collinear
-exponentials changes them by 4e-7.
+its printed data (sum of squares 1.4e-25). Lanczos3 needs 6 for those: standard errors come from the
+rows before the last step, and a step of 1e-8 of its nearly collinear exponentials changes them by
+4e-7. Which steps are taken last depends on rounding.
 """
 
 import sys
@@ -116,7 +116,12 @@ def scores(default_fits) -> dict[tuple[str, int], tuple[float, float, int, str]]
     }
 
 
-FEWER_DIGITS = {("Lanczos1", 1): 2.0, ("Lanczos1", 2): 2.0, ("Lanczos3", 2): 6.0}
+FEWER_DIGITS = {
+    ("Lanczos1", 1): 2.0,
+    ("Lanczos1", 2): 2.0,
+    ("Lanczos3", 1): 6.0,
+    ("Lanczos3", 2): 6.0,
+}
 """Digits of the standard errors where these are fewer than 7, see above."""
 
 

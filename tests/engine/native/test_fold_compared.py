@@ -63,7 +63,9 @@ def test_all_instruction_sets_give_the_same_bits(name):
     arguments, measured = make_arguments(name, 21), draw_measured(21, 6)
     p = arguments[4].pattern.parameters
     factor = np.zeros((1, p + 1, p + 1))
-    results = [e.fold_compared(factor, *arguments, measured) for e in ENGINES]
+    calls = [e.fold_compared for e in ENGINES if e.fold_compared is not None]
+    assert len(calls) == len(ENGINES)
+    results = [fold(factor, *arguments, measured) for fold in calls]
     first, *others = ([*list_arrays(r[0]).values(), *r[1:]] for r in results)
     for other in others:
         for ours, theirs in zip(first, other, strict=True):
@@ -99,6 +101,7 @@ def test_a_measured_pose_gives_a_residual_of_zero_at_itself():
     for engine in ENGINES:
         measured = ComparedPoses(np.arange(9), reference, whitener)
         zeros = np.zeros((1, p + 1, p + 1))
+        assert engine.fold_compared is not None
         _, factor, _ = engine.fold_compared(zeros, program, e, q, start, inputs, measured)
         assert_allclose(factor[0, :, p], 0.0, atol=1e-14)  # [rad, m]: rounding of poses
 

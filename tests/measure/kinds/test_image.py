@@ -2,6 +2,7 @@
 """Pictures of a printed board: the projection is written here a second time, in plain loops."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -25,8 +26,9 @@ LENS_VALUES = np.array([3000.0, 3100.0, 2000.0, 1500.0, 0.1, -0.2, 0.05, 0.001, 
 BOARD = np.array([[0.02 * (i % 9), 0.02 * (i // 9), 0.0] for i in range(54)])
 
 
-def project_by_hand(x, y, z, lens):
+def project_by_hand(point, lens):
     """The formulas of OpenCV's documentation, for one point."""
+    x, y, z = point
     fx, fy, cx, cy, k1, k2, k3, p1, p2 = lens
     a, b = x / z, y / z
     r2 = a**2 + b**2
@@ -36,13 +38,13 @@ def project_by_hand(x, y, z, lens):
     return fx * u + cx, fy * v + cy
 
 
-def draw_pictures(n=12, seed=0):
+def draw_pictures(n: int = 12, seed: int = 0):
     """Return poses (n, 4, 4) of a board in front of a camera, and its exact pixels (n, 54, 2)."""
     rng = np.random.default_rng(seed)
     R = geometry.exp_so3(rng.uniform(-0.6, 0.6, (n, 3)))
     t = rng.uniform([-0.15, -0.1, 0.4], [-0.05, 0.0, 0.6], (n, 3))
     pixels = [
-        [project_by_hand(*(of @ p + at), LENS_VALUES) for p in BOARD]
+        [project_by_hand(of @ p + at, LENS_VALUES) for p in BOARD]
         for of, at in zip(R, t, strict=True)
     ]
     return geometry.make_pose(R, t), np.array(pixels)
@@ -51,14 +53,16 @@ def draw_pictures(n=12, seed=0):
 def test_projection_and_its_slopes_agree_with_plain_formulas_and_complex_steps() -> None:
     x = np.random.default_rng(1).normal(size=(7, 3)) * 0.3 + [0.0, 0.0, 1.0]
     pixels, by_point, by_lens = project(x, LENS_VALUES)
-    expected = [project_by_hand(*point, LENS_VALUES) for point in x]
+    expected = [project_by_hand(point, LENS_VALUES) for point in x]
     np.testing.assert_allclose(pixels, expected, atol=1e-9)  # [px], rounding of 3000 px
     step = 1e-30
     for i, d in enumerate(np.eye(3)):
-        moved = project(x + 1j * step * d, LENS_VALUES.astype(complex), False)[0].imag / step
+        complex_x: Any = x + 1j * step * d
+        moved = project(complex_x, LENS_VALUES, False)[0].imag / step
         np.testing.assert_allclose(by_point[..., i], moved, rtol=1e-12, atol=1e-8)
     for i, d in enumerate(np.eye(9)):
-        moved = project(x.astype(complex), LENS_VALUES + 1j * step * d, False)[0].imag / step
+        lens: Any = LENS_VALUES + 1j * step * d
+        moved = project(x, lens, False)[0].imag / step
         np.testing.assert_allclose(by_lens[..., i], moved, rtol=1e-12, atol=1e-8)
     np.testing.assert_allclose(find_rays(pixels, LENS_VALUES), x / x[:, 2:], atol=1e-12)
 
@@ -78,7 +82,9 @@ def test_focal_lengths_follow_in_closed_form_without_distortion() -> None:
     lens = np.where(np.arange(9) < 4, LENS_VALUES, 0.0)
     x = (poses[:, None, :3, :3] @ BOARD[..., None])[..., 0] + poses[:, None, :3, 3]
     pixels = project(x, lens)[0]
-    np.testing.assert_allclose(solve_focal_lengths(BOARD, pixels, lens[2:4]), lens[:2], rtol=1e-8)
+    focal = solve_focal_lengths(BOARD, pixels, lens[2:4])
+    assert focal is not None
+    np.testing.assert_allclose(focal, lens[:2], rtol=1e-8)
     level = np.tile(geometry.make_pose(np.eye(3), np.array([-0.1, 0.0, 0.5])), (4, 1, 1))
     x = (level[:, None, :3, :3] @ BOARD[..., None])[..., 0] + level[:, None, :3, 3]
     assert solve_focal_lengths(BOARD, project(x, lens)[0], lens[2:4]) is None
@@ -136,16 +142,16 @@ def test_corners_of_the_kind_are_those_of_the_plain_formulas() -> None:
             ]
             body = T if mount == "board" else np.linalg.inv(T)
             x = (np.linalg.inv(camera) @ body @ board @ p)[:3]
-            np.testing.assert_allclose(found[i, 1:], project_by_hand(*x, LENS_VALUES), atol=1e-8)
+            np.testing.assert_allclose(found[i, 1:], project_by_hand(x, LENS_VALUES), atol=1e-8)
 
 
 def look_down(height):
     return geometry.make_pose(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, height]))
 
 
-def make_kind(**settings):
+def make_kind(**settings: Any) -> Image:
     """Return a board that lies on the platform, seen by a camera 0.5 m above it."""
-    usual = {"corners": (5, 4), "square": 0.02, "focal": (4000.0, 4000.0)}
+    usual: dict[str, Any] = {"corners": (5, 4), "square": 0.02, "focal": (4000.0, 4000.0)}
     board = geometry.make_pose(np.diag([1.0, -1.0, -1.0]), np.array([-0.04, 0.03, 0.01]))
     return Image(**(usual | {"T_camera": look_down(0.7), "T_board": board} | settings))
 
@@ -167,6 +173,8 @@ def test_file_of_two_cameras_assigns_rows_by_the_columns_camera_and_board(tmp_pa
     loaded = load_measurements(path, robot)
     for old, new in zip(data.observations, loaded.observations, strict=True):
         np.testing.assert_allclose(new.measured, old.measured)
+        assert isinstance(new.kind, Image)
+        assert isinstance(old.kind, Image)
         assert (new.kind.camera, new.kind.lens) == (old.kind.camera, "phone")
     # the same with the columns of the cameras in place of the labels of the kinds
     named = text.replace("kind,", "camera,").replace(",image-1,", ",a,").replace(",image-2,", ",b,")

@@ -42,7 +42,7 @@ SETTING_DECIMALS = 3
 UNIT_CODES = {"mm": "G21", "in": "G20"}
 
 
-Stops = tuple[tuple[str, ...], tuple[str, ...], FloatArray]
+Stops = tuple[Sequence[str], Sequence[str], FloatArray]
 """Labels of the poses (or "home"), uses (fit, held-out or via), and coordinates (n, c) [m, rad]."""
 
 
