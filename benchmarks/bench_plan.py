@@ -66,10 +66,11 @@ def _exchange_by_hand(rows: Array, n: int) -> Array:
 
     scale = np.sqrt((rows**2).sum(axis=(0, 1)))
     rows = rows / scale
-    M, chosen = 1e-6 * np.eye(rows.shape[2]), np.zeros(0, dtype=np.int64)
+    M, places = 1e-6 * np.eye(rows.shape[2]), list[int]()
     for _ in range(n):
-        chosen = np.append(chosen, int(np.argmax(gain(M))))
-        M = M + rows[chosen[-1]].T @ rows[chosen[-1]]
+        places.append(int(np.argmax(gain(M))))
+        M = M + rows[places[-1]].T @ rows[places[-1]]
+    chosen = np.array(places)
     for j in range(n):
         M = M - rows[chosen[j]].T @ rows[chosen[j]]
         chosen[j] = np.argmax(gain(M))

@@ -153,7 +153,9 @@ def make_kind(**settings: Any) -> Image:
     """Return a board that lies on the platform, seen by a camera 0.5 m above it."""
     usual: dict[str, Any] = {"corners": (5, 4), "square": 0.02, "focal": (4000.0, 4000.0)}
     board = geometry.make_pose(np.diag([1.0, -1.0, -1.0]), np.array([-0.04, 0.03, 0.01]))
-    return Image(**(usual | {"T_camera": look_down(0.7), "T_board": board} | settings))
+    usual |= {"T_camera": look_down(0.7), "T_board": board}
+    usual |= settings
+    return Image(**usual)
 
 
 def make_poses(n=6, seed=3):
