@@ -552,7 +552,10 @@ def inverse(robot: Mechanism, target: ArrayLike, start: Solution | None = None) 
         state = solve_in_mode(robot, partial(reach_coordinates, robot), coordinates, begin)
     else:
         raise DataError(f"a target of shape {wanted.shape} was given. Allowed: {shapes}")
-    return make_solution(robot, state, compute_readings(robot, values, state)[0])
+    q = compute_readings(robot, values, state)[0]
+    lost = (state.status == Status.CONVERGED) & ~np.isfinite(q).all(axis=-1)
+    status = np.where(lost, np.int8(Status.UNREACHABLE), state.status)
+    return make_solution(robot, replace(state, status=status), q)
 
 
 def are_poses(robot: Mechanism, targets: ArrayLike) -> bool:

@@ -457,8 +457,8 @@ def readings_from_joints(
     joints: FloatArray, tau: FloatArray, constants: FloatArray, loads: FloatArray | None = None
 ) -> FloatArray:
     """Return the readings (t, n, r) of joint values at loads (t | 1, n, a) of the rows, without
-    backlash; Newton's method adds what is not linear. Other readings that are never commanded have
-    their reference, and loads are zero without `loads`.
+    backlash; Newton's method adds what is not linear; NaN where no reading gives the value. Other
+    readings that are never commanded have their reference, and loads are zero without `loads`.
     """
     if (weights := select_weights(tau, constants)) is not None:
         joints = apply_weights(weights, joints)
@@ -499,7 +499,7 @@ def readings_from_joints(
         readings = readings - step
         if np.abs(step).max(initial=0.0) <= 1e-15 * np.abs(readings).max(initial=1.0):
             break
-    return readings
+    return np.where(np.abs(step) <= 1e-9 * (1.0 + np.abs(readings)), readings, np.nan)
 
 
 def _guess_readings(

@@ -267,6 +267,8 @@ def test_a_pose_that_no_reading_gives_has_a_status(tmp_path: Path) -> None:
         status, q = library.call("inverse", np.array([0, 0, height, 0, 0, 0]), 6)
         assert status == expected
         assert np.isfinite(q).all() == (expected == 0)
+        solved = lc.inverse(robot, np.array([[0, 0, height, 0, 0, 0]]))
+        assert solved.converged[0] == (expected == 0)
 
 
 def test_terms_without_an_input_in_the_file_are_named() -> None:
