@@ -83,7 +83,7 @@ def photos(
     folder: Path = opt.argument("DIR", type=opt.FILE),
     board: Path = opt.path("File of the board, by loopcal board.", required=True),
     poses: Path | None = opt.path(
-        "Table of the poses, such as poses.csv. Pictures are named like its poses, or are in their "
+        "Table of the poses, such as poses.csv. Pictures have its names of poses, or their "
         "order, or its column 'picture' names them.  [default: names of the pictures]"
     ),
     mount: str = opt.option(
@@ -110,7 +110,7 @@ def photos(
 ) -> Output:
     """Find the corners of a printed board in all pictures of the folder DIR, by OpenCV.
 
-    Blurred or mirrored pictures, and those of another camera or zoom, are left out with a reason.
+    loopcal leaves out blurred, mirrored and zoomed pictures and other sizes, each with a reason.
     EXIF data give the first focal length. The command needs the extra 'camera'.
 
     Examples:
