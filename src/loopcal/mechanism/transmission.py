@@ -493,6 +493,7 @@ def readings_from_joints(
         return readings
     if count_points(constants):
         readings = _guess_readings(joints, readings, tau, constants)
+    step = np.zeros_like(readings)
     for _ in range(20):
         slopes = evaluate_slopes(readings, tau, constants)
         step = (evaluate_sums(readings, tau, constants) - joints) / slopes
