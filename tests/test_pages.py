@@ -24,6 +24,7 @@ OWN_TESTS = {
     "docs/extending.md": "tests/test_extending.py",
     "docs/hexapod-with-tracker.md": "tests/cli/test_hexapod_page.py",
     "docs/python.md": "tests/report/test_python_page.py",
+    "docs/phone-and-board.md": "tests/cli/test_pictures.py",
     "docs/planning.md": "tests/cli/test_planning_page.py",
     "docs/report.md": "tests/documents/test_report_page.py",
     "docs/studies.md": "tests/cli/test_studies_page.py",

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The commands `loopcal board` and `loopcal photos`."""
 
+import shutil
 import sys
 from pathlib import Path
 
@@ -12,6 +13,7 @@ import loopcal as lc
 from loopcal.geometry import exp_so3, make_pose
 from loopcal.io.board import choose_board, format_board, read_board
 from loopcal.measure.kinds.image import Image as ImageKind
+from tests.cli.page_commands import run_page
 from tests.io.boards import render
 
 LENS = np.array([1000.0, 1003.0, 405.0, 297.0, 0.05, -0.1, 0.0, 0.0, 0.0])
@@ -98,3 +100,14 @@ def test_photos_without_opencv_name_the_extra(loopcal, tmp_path, monkeypatch) ->
     (tmp_path / "a.jpg").write_bytes(b"")
     monkeypatch.setitem(sys.modules, "cv2", None)
     loopcal("photos . --board board.yaml -o points.csv", "pip install 'loopcal[camera]'", code=1)
+
+
+@pytest.mark.slow
+def test_page_leads_from_the_board_to_a_calibration(
+    photographed, tmp_path, root, monkeypatch
+) -> None:
+    shutil.copytree(photographed / "pictures", tmp_path / "pictures")
+    shutil.copy(photographed / "poses.csv", tmp_path)
+    monkeypatch.chdir(tmp_path)
+    run_page((root / "docs" / "phone-and-board.md").read_text("utf-8"))
+    assert lc.load_run("run").result["fit"]["degrees"] > 0

@@ -102,6 +102,7 @@ def test_written_file_is_read_back_with_the_measured_lengths(tmp_path) -> None:
         ("square: 15 mm", "square: 15"),
         ("format: 1", "format: 2"),
         ("# measured: [135.00", "measured: [-1"),
+        ("# measured: [135.00", "measured: [165.00"),  # the whole board, not the lines
         ("dictionary", "dictionnary"),
     ],
 )

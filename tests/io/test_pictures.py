@@ -76,6 +76,14 @@ def test_picture_rotated_by_half_a_turn_has_the_same_numbers(tmp_path) -> None:
     assert np.abs(back - plain.pixels[np.argsort(plain.corners)]).max() < 0.05
 
 
+def test_picture_of_sixteen_bits_shows_the_same_corners(tmp_path) -> None:
+    picture = render(BOARD, place("straight"), LENS, SIZE)
+    plain = examine(save(tmp_path, picture))
+    deep = examine(save(tmp_path, picture.astype(np.uint16) * 200, "deep.png"))
+    np.testing.assert_array_equal(plain.corners, deep.corners)
+    assert np.abs(plain.pixels - deep.pixels).max() < 0.02
+
+
 def test_pictures_that_show_no_sharp_board_are_left_out_with_their_reason(tmp_path) -> None:
     T = place("straight")
     sharp = render(BOARD, T, LENS, SIZE)

@@ -29,6 +29,8 @@ CALIPER = 0.140
 """Length that a common caliper can measure [m]."""
 CALIPER_SD = 5e-5
 """Standard deviation of a length that was measured with it from line to line [m]."""
+MOST_SCALE = 0.1
+"""Scale of a print, as a share, beyond which other lines were measured."""
 PAPERS = {"a4": (0.297, 0.210), "a3": (0.420, 0.297), "letter": (0.2794, 0.2159)}
 """Width and height of a sheet [m]."""
 SIDE, BELOW = 0.020, 0.016
@@ -67,8 +69,14 @@ class Board:
             )
         if not 0.0 < self.marker < self.square:
             raise DataError("a marker must be smaller than a square, and both above 0")
-        if self.measured_sd <= 0.0 or min(self.measured or (1.0,)) <= 0.0:
-            raise DataError("the measured lengths and their standard deviation must be above 0")
+        if not self.measured_sd > 0.0:
+            raise DataError("the standard deviation of the measured lengths must be above 0")
+        for axis, found, mark in zip("xy", self.measured or self.marks, self.marks, strict=True):
+            if not abs(found / mark - 1.0) < MOST_SCALE:
+                raise DataError(
+                    f"the measured length along {axis} is {1e3 * found:g} mm, but the lines are "
+                    f"{1e3 * mark:g} mm apart as designed. Measure from line to line"
+                )
 
     @property
     def corners(self) -> tuple[int, int]:

@@ -135,7 +135,11 @@ def _load_picture(path: Path) -> tuple[np.ndarray[Any, np.dtype[np.uint8]], floa
         with Image.open(path) as picture:
             details = picture.getexif().get_ifd(0x8769)
             film = float(details.get(0xA405) or 0.0)  # FocalLengthIn35mmFilm
-            gray = np.asarray(picture.convert("L"))
+            if picture.mode[0] in "IF":  # 16 bits and more, as of industrial cameras
+                deep = np.asarray(picture).astype(float)
+                gray = (255.0 * deep / max(deep.max(), 1e-9)).clip(0.0).astype(np.uint8)
+            else:
+                gray = np.asarray(picture.convert("L"))
     except UnidentifiedImageError as error:
         raise ValueError("its format is unknown") from error
     except Image.DecompressionBombError as error:

@@ -135,6 +135,8 @@ def photos(
     paths = of.list_pictures(folder)
     refuse_outputs((output, page_file), (board, poses, *paths), force)
     load_dictionary(import_optional("cv2", "camera"), known)
+    if known.measured is None:
+        terminal.print_finding("pictures.board-unmeasured")
     names, beside = of.name_poses(paths, poses), of.refer_to_poses(poses, output)
     count = min(workers or count_processors(), len(paths))
     executor = Serial() if count == 1 else Processes(count)
