@@ -111,3 +111,21 @@ def test_page_leads_from_the_board_to_a_calibration(
     monkeypatch.chdir(tmp_path)
     run_page((root / "docs" / "phone-and-board.md").read_text("utf-8"))
     assert lc.load_run("run").result["fit"]["degrees"] > 0
+
+
+@pytest.mark.slow
+def test_measured_lengths_correct_a_board_printed_at_97_percent(
+    photographed, loopcal, monkeypatch
+) -> None:
+    """The file says squares of 12 mm / 0.97, and the caliper what the printer made of them."""
+    monkeypatch.chdir(photographed)
+    text = Path("board.yaml").read_text("utf-8")
+    text = text.replace("square: 12 mm", f"square: {12 / 0.97} mm")
+    Path("shrunk.yaml").write_text(text.replace("marker: 9 mm", f"marker: {9 / 0.97} mm"))
+    loopcal("photos pictures --board shrunk.yaml --poses poses.csv -o shrunk.csv")
+    loopcal("photos pictures --board board.yaml --poses poses.csv -o plain.csv")
+    for name in ("plain", "shrunk"):
+        loopcal(f"calibrate hexapod-42 {name}.csv -o {name}", code=(0, 2))
+    plain, shrunk = (lc.load_run(name) for name in ("plain", "shrunk"))
+    assert np.abs(shrunk.robot.values - plain.robot.values).max() < 2e-6  # [m, rad]
+    assert "board.scale_x: {start: -0.03," in Path("shrunk.csv").read_text("utf-8")
