@@ -16,7 +16,10 @@ from numpy.typing import ArrayLike
 from loopcal.typing import FloatArray
 
 
-def _distribution(name: str) -> Callable[..., FloatArray]:
+Distribution = Callable[..., FloatArray]
+
+
+def _distribution(name: str) -> Distribution:
     """Return a function of `scipy.special`, whose arguments broadcast."""
 
     def evaluate(*arguments: ArrayLike) -> FloatArray:
@@ -25,32 +28,32 @@ def _distribution(name: str) -> Callable[..., FloatArray]:
     return evaluate
 
 
-normal_probability = _distribution("ndtr")
+normal_probability: Distribution = _distribution("ndtr")
 """Probability of at most x."""
 
-normal_quantile = _distribution("ndtri")
+normal_quantile: Distribution = _distribution("ndtri")
 """Value that is not exceeded with a probability."""
 
-chi_square_tail = _distribution("chdtrc")
+chi_square_tail: Distribution = _distribution("chdtrc")
 """Probability of more than x with k degrees of freedom."""
 
-chi_square_quantile = _distribution("chdtri")
+chi_square_quantile: Distribution = _distribution("chdtri")
 """Value that k degrees of freedom exceed with a probability."""
 
-f_tail = _distribution("fdtrc")
+f_tail: Distribution = _distribution("fdtrc")
 """Probability of more than x with k and `left` degrees of freedom."""
 
-f_quantile = _distribution("fdtri")
+f_quantile: Distribution = _distribution("fdtri")
 """Value that is not exceeded with a probability."""
 
-student_probability = _distribution("stdtr")
+student_probability: Distribution = _distribution("stdtr")
 """Probability of at most t with some degrees of freedom."""
 
-student_quantile = _distribution("stdtrit")
+student_quantile: Distribution = _distribution("stdtrit")
 """Value of t that is not exceeded with a probability."""
 
-beta_probability = _distribution("betainc")
+beta_probability: Distribution = _distribution("betainc")
 """Probability of at most x, of the parameters a and b."""
 
-binomial_tail = _distribution("bdtrc")
+binomial_tail: Distribution = _distribution("bdtrc")
 """Probability of more than k of n trials."""
