@@ -15,7 +15,6 @@ from numpy.typing import ArrayLike
 
 from loopcal.typing import FloatArray
 
-
 Distribution = Callable[..., FloatArray]
 
 
