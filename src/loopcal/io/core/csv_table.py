@@ -283,6 +283,9 @@ class Table:
 class Places(Sequence[str]):
     """Files and lines of rows, which are worded where one is asked for."""
 
+    number: IntArray
+    rows: IntArray
+
     def __init__(self, tables: Sequence[Table], number: IntArray, rows: IntArray) -> None:
         """`number` (n,) of the table that has each of the `rows` (n,); -1 without any."""
         self._tables, self.number, self.rows = tables, number, rows

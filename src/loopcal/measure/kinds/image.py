@@ -29,7 +29,9 @@ from loopcal.parameters import Parameter
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension, Length, Pixel, Ratio
 
-LENS_ITEMS = {"focal": LENS[:2], "center": LENS[2:4], "radial": LENS[4:7], "tangential": LENS[7:]}
+LENS_ITEMS: Mapping[str, tuple[str, ...]] = {
+    "focal": LENS[:2], "center": LENS[2:4], "radial": LENS[4:7], "tangential": LENS[7:],
+}  # fmt: skip
 PRINT, BEND = ("scale_x", "scale_y"), ("bend_x", "bend_y", "bend_xy")
 PICTURES = 40  # pictures, evenly chosen, of which start values are made
 GRAZING = 0.2  # sine of the angle between board and line of sight below which no corner is found
