@@ -10,13 +10,13 @@ branches or series.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from functools import partial
 from itertools import permutations, product
 
 import numpy as np
 
 from loopcal.errors import DataError
-from loopcal.frozen_dataclass import dataclass, field
 from loopcal.numerics.decomposition import are_nonzero
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from functools import cached_property
 from typing import TypeVar
@@ -12,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loopcal.errors import DataError, MechanismError, suggest_names
-from loopcal.frozen_dataclass import dataclass, replace
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import Dimension
 

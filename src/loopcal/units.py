@@ -11,11 +11,11 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
+from dataclasses import dataclass
 from enum import Enum
 from typing import Annotated, Any
 
 from loopcal.errors import UnitError, suggest_names
-from loopcal.frozen_dataclass import dataclass
 
 
 class Dimension(Enum):

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Mistakes with pictures of a printed board are named as the cause of residuals."""
 
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -15,7 +16,6 @@ from loopcal.diagnose.picture_errors import (
     measure_picture_errors,
 )
 from loopcal.estimate.fit_linearization import linearize_fit
-from loopcal.frozen_dataclass import replace
 from loopcal.measure.instrument import Gaussian, Instrument, Sensor
 from loopcal.measure.kinds.image import Image
 from loopcal.measure.simulation import sample_truth, simulate_trials

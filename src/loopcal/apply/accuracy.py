@@ -15,6 +15,7 @@ is known, and that of Student's t for the effective degrees of freedom where it 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, ClassVar, Literal, NamedTuple, get_args
 
@@ -47,7 +48,6 @@ from loopcal.estimate.residual_test import coverage_factor
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding
 from loopcal.findings.wording import round_to_digits
-from loopcal.frozen_dataclass import dataclass, replace
 from loopcal.measure.instrument import Instrument
 from loopcal.measure.simulation import Trials, sample_truth, simulate_trials
 from loopcal.mechanism.assembly import AXES, TWIST_UNITS

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,6 @@ from loopcal.errors import DataError, suggest_names
 from loopcal.estimate.options import OBJECT, FitOptions, check_labels
 from loopcal.estimate.posterior import Posterior
 from loopcal.findings import report_finding
-from loopcal.frozen_dataclass import dataclass, field, replace
 from loopcal.measure.array_checks import check_seed, check_type
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations

@@ -11,6 +11,7 @@ part remains, and the result states it for each target. See docs/theory/accuracy
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Any, ClassVar, Literal, get_args
 
@@ -27,7 +28,6 @@ from loopcal.estimate.posterior import Posterior
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
 from loopcal.findings.wording import name_count
-from loopcal.frozen_dataclass import dataclass, replace
 from loopcal.mechanism.assembly import AXES, TWIST_UNITS
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import list_dimensions, read_coordinates

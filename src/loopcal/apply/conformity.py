@@ -27,6 +27,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from enum import Enum
 from typing import Any, ClassVar, NamedTuple
 
@@ -35,7 +36,6 @@ import numpy as np
 from loopcal.diagnose.row_errors import PoseErrors
 from loopcal.errors import EstimationError
 from loopcal.findings import Finding, Quantity, report_finding
-from loopcal.frozen_dataclass import dataclass
 from loopcal.measure.observations import Observations
 from loopcal.numerics.statistics import (
     compute_chi_square_quantile,

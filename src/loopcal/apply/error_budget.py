@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, replace
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -45,7 +45,6 @@ from loopcal.estimate.result import Identification
 from loopcal.estimate.unfixed_motions import find_frame_knowledge
 from loopcal.findings import Finding, report_finding
 from loopcal.findings.wording import round_to_digits
-from loopcal.frozen_dataclass import dataclass, replace
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations, StatedSize, find_size
 from loopcal.mechanism.model import Mechanism

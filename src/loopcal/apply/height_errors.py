@@ -15,6 +15,7 @@ setup parameters that fit it best at the fitted rows.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -30,7 +31,6 @@ from loopcal.estimate.residual_test import DOUBT
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, Quantity, report_finding
 from loopcal.findings.wording import round_to_digits
-from loopcal.frozen_dataclass import dataclass
 from loopcal.measure.kinds.poses import Component
 from loopcal.measure.kinds.surfaces import Plane
 from loopcal.measure.measurements import Measurements

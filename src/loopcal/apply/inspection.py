@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar
 
@@ -20,7 +21,6 @@ from loopcal.diagnose.identifiable_parameters import (
     suggest_measurements,
 )
 from loopcal.findings import Finding, report_finding
-from loopcal.frozen_dataclass import dataclass
 from loopcal.measure.measurements import Measurements
 from loopcal.mechanism.families.joint_release import propose_added_joints
 from loopcal.mechanism.model import Mechanism

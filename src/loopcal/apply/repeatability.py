@@ -20,6 +20,7 @@ Derivation and measured coverage: docs/theory/accuracy.md.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -30,7 +31,6 @@ from loopcal.errors import DataError
 from loopcal.estimate.residual_test import coverage_factor
 from loopcal.findings import Finding, report_finding
 from loopcal.findings.wording import round_to_digits
-from loopcal.frozen_dataclass import dataclass, replace
 from loopcal.measure.data_checks import check_actuators
 from loopcal.measure.kinds.kind import ErrorGroup
 from loopcal.measure.measurements import Measurements

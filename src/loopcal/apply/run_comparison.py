@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -27,7 +28,6 @@ from loopcal.estimate.recalibration import (
     judge_change,
 )
 from loopcal.findings import Finding, report_finding
-from loopcal.frozen_dataclass import dataclass, field, replace
 from loopcal.measure.measurements import Measurements
 from loopcal.mechanism.model import Mechanism
 from loopcal.numerics.statistics import compute_single_level

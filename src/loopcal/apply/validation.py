@@ -17,6 +17,7 @@ contains no error of the setup, and before and after differ by the geometry only
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
 from typing import Any, ClassVar
 
@@ -46,7 +47,6 @@ from loopcal.estimate.residual_test import SIGMA_AS_STATED, NoiseKnowledge
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, Quantity, Severity, report_finding
 from loopcal.findings.wording import list_names, name_count, round_to_digits
-from loopcal.frozen_dataclass import dataclass, field, replace
 from loopcal.measure.data_checks import check_actuators, check_types
 from loopcal.measure.fitted_rows import FittedRows
 from loopcal.measure.kinds.kind import SCALES

@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, ClassVar, NamedTuple
 
@@ -36,7 +37,6 @@ from loopcal.estimate.posterior import Posterior
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, Severity, report_finding
 from loopcal.findings.catalog import word_phrase
-from loopcal.frozen_dataclass import dataclass, field
 from loopcal.measure.array_checks import check_array
 from loopcal.measure.instrument import make_random_stream
 from loopcal.mechanism.model import Mechanism

@@ -12,6 +12,7 @@ import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from functools import wraps
 from importlib import import_module
 from inspect import cleandoc, signature
@@ -24,7 +25,6 @@ import click
 import loopcal as lc
 from loopcal.cli import terminal
 from loopcal.errors import DataError, LoopcalError, UnitError, suggest_names
-from loopcal.frozen_dataclass import dataclass
 from loopcal.registry import Registry
 from loopcal.units import Dimension, find_unit, parse_number, parse_quantity
 

@@ -11,6 +11,7 @@ import textwrap
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from io import TextIOWrapper
 from pathlib import Path
 from types import TracebackType
@@ -19,7 +20,6 @@ from typing import TYPE_CHECKING, Any, Self, TextIO
 import click
 
 from loopcal.errors import FileError
-from loopcal.frozen_dataclass import dataclass
 from loopcal.plain_text import escape
 
 if TYPE_CHECKING:

@@ -11,6 +11,7 @@ larger. See docs/theory/uncertainty.md.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -59,7 +60,6 @@ from loopcal.estimate.posterior import NOISE
 from loopcal.estimate.residual_test import choose_severity
 from loopcal.estimate.result import Identification, add_covariance
 from loopcal.findings import Finding, Quantity, Severity, report_finding
-from loopcal.frozen_dataclass import dataclass, replace
 from loopcal.measure.measurements import Measurements
 from loopcal.numerics.statistics import choose_evenly, compute_median, find_distinct
 from loopcal.typing import BoolArray, FloatArray

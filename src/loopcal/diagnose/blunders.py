@@ -10,6 +10,7 @@ the level of the search. Where none fits, the finding says which were tried.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -38,7 +39,6 @@ from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.observation_rows import linked_blocks, list_block_labels
 from loopcal.estimate.problem import problem_of
 from loopcal.findings import Finding, report_finding
-from loopcal.frozen_dataclass import dataclass, field, replace
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.readings import fill_in_reading_sigma
 from loopcal.mechanism.model import Mechanism

@@ -16,6 +16,7 @@ See docs/theory/uncertainty.md.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any, ClassVar, Literal, NamedTuple, get_args
 
 import numpy as np
@@ -49,7 +50,6 @@ from loopcal.estimate.resampling import ResampleFits, Resamples, draw_centers, f
 from loopcal.estimate.residual_test import LEVEL, coverage_factor
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
-from loopcal.frozen_dataclass import dataclass
 from loopcal.measure.measurements import Measurements
 from loopcal.numerics.decomposition import NUISANCE_TOLERANCE, are_nonzero
 from loopcal.numerics.elimination import find_connected_groups

@@ -15,6 +15,7 @@ Tipton, 2018). See docs/theory/uncertainty.md.
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -23,7 +24,6 @@ from loopcal.diagnose.outliers import TESTABLE
 from loopcal.diagnose.residual_patterns import number_days
 from loopcal.estimate.fit_linearization import FitLinearization
 from loopcal.estimate.observation_rows import linked_blocks
-from loopcal.frozen_dataclass import dataclass, replace
 from loopcal.measure.measurements import Measurements
 from loopcal.numerics.elimination import find_connected_groups, fold_at
 from loopcal.numerics.statistics import choose_evenly, compute_chi_square_tail

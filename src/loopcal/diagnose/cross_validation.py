@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
@@ -47,7 +48,6 @@ from loopcal.estimate.penalties import (
 from loopcal.estimate.problem import problem_of
 from loopcal.findings import Finding, report_finding
 from loopcal.findings.wording import round_to_digits
-from loopcal.frozen_dataclass import dataclass, replace
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.readings import fill_in_reading_sigma
 from loopcal.mechanism.model import Mechanism

@@ -11,6 +11,8 @@ Biometrika 58 (1971); docs/theory/residual-patterns.md.
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+
 import numpy as np
 
 from loopcal.diagnose.residual_patterns import (
@@ -28,7 +30,6 @@ from loopcal.estimate.fit_linearization import FitLinearization
 from loopcal.estimate.linearization import evaluate_rows
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
-from loopcal.frozen_dataclass import dataclass, replace
 from loopcal.measure.measurements import Measurements
 from loopcal.mechanism.sensitivity import differentiate_pose
 from loopcal.numerics.statistics import find_distinct

@@ -19,6 +19,7 @@ Derivation: docs/theory/observability.md.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -38,7 +39,6 @@ from loopcal.estimate.posterior import Posterior
 from loopcal.estimate.result import Identification
 from loopcal.estimate.unfixed_motions import MOTIONS, frame_twists
 from loopcal.findings import Finding, report_finding
-from loopcal.frozen_dataclass import dataclass
 from loopcal.measure.measurements import Measurements
 from loopcal.mechanism.kinematics import compute_readings
 from loopcal.mechanism.model import Mechanism

@@ -15,6 +15,7 @@ rigid motion, which may be large. No robot and no pose enters. The noise is the 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -23,7 +24,6 @@ from loopcal import engine, geometry
 from loopcal.diagnose.residual_patterns import order_by_time
 from loopcal.estimate.false_alarms import FALSE_ALARMS
 from loopcal.findings import Finding, Quantity, report_finding
-from loopcal.frozen_dataclass import dataclass, replace
 from loopcal.measure.kinds.position import Position
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations

@@ -14,6 +14,7 @@ See docs/theory/observability.md.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -27,7 +28,6 @@ from loopcal.estimate.null_space import Combination
 from loopcal.estimate.result import Identification
 from loopcal.estimate.unfixed_motions import frame_twists
 from loopcal.findings import Finding, report_finding
-from loopcal.frozen_dataclass import dataclass, field, replace
 from loopcal.mechanism.chains import get_platforms
 from loopcal.mechanism.kinematics import compute_readings, find_directly_reachable, forward_trials
 from loopcal.mechanism.model import Mechanism

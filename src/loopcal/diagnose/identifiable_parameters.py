@@ -11,6 +11,7 @@ X B' stays open. A combination is determined when no direction of that null spac
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -41,7 +42,6 @@ from loopcal.estimate.prior_inflation import restate
 from loopcal.findings import Finding, report_finding
 from loopcal.findings.catalog.phrases import effect
 from loopcal.findings.wording import list_names, round_to_digits
-from loopcal.frozen_dataclass import dataclass
 from loopcal.measure.array_checks import check_type
 from loopcal.measure.data_checks import check_actuators
 from loopcal.measure.instrument import SIGMA, Gaussian, Instrument, Sensor

@@ -21,6 +21,7 @@ See docs/theory/uncertainty.md.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from typing import Any, ClassVar, Literal, NamedTuple, get_args
 
@@ -33,7 +34,6 @@ from loopcal.estimate.residual_test import LEVEL, coverage_factor
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
 from loopcal.findings.wording import round_to_digits
-from loopcal.frozen_dataclass import dataclass
 from loopcal.numerics.decomposition import NULL_COMPONENT
 from loopcal.numerics.statistics import compute_f_quantile, compute_f_tail, compute_single_level
 from loopcal.results.description import OTHER, Field, fields, label_axes

@@ -20,6 +20,7 @@ sigma is. Source: Draper and Smith, Applied Regression Analysis.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import ClassVar, NamedTuple
 
 import numpy as np
@@ -46,7 +47,6 @@ from loopcal.estimate.smooth_errors import (
     describe_smooth_errors,
 )
 from loopcal.findings import Finding, report_finding
-from loopcal.frozen_dataclass import dataclass, replace
 from loopcal.measure.measurements import Measurements
 from loopcal.mechanism.solutions import forward
 from loopcal.numerics.statistics import (

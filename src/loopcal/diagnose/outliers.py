@@ -22,6 +22,7 @@ geometry so far that right poses seem wrong. Blocks are then compared at a robus
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, ClassVar, NamedTuple
 
@@ -39,7 +40,6 @@ from loopcal.estimate.problem import Problem, problem_of
 from loopcal.estimate.residual_test import FEWEST_DEGREES, SIGNIFICANCE, count_sigma_degrees
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
-from loopcal.frozen_dataclass import dataclass, replace
 from loopcal.measure.measurements import Measurements
 from loopcal.numerics.decomposition import Decomposition
 from loopcal.numerics.statistics import (

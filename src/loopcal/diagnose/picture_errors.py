@@ -10,6 +10,7 @@ scales of a print. They are compared with errors of any size in all corners of a
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import Any, cast
 
 import numpy as np
@@ -20,7 +21,6 @@ from loopcal.estimate.fit_linearization import FitLinearization
 from loopcal.estimate.identification import identify
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, Severity, report_finding
-from loopcal.frozen_dataclass import replace
 from loopcal.measure.kinds.image import Image
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations

@@ -7,6 +7,7 @@ Each session is examined by itself, since the instrument may have moved between 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -14,7 +15,6 @@ import numpy as np
 
 from loopcal.errors import DataError
 from loopcal.findings import Finding, Quantity, report_finding
-from loopcal.frozen_dataclass import dataclass
 from loopcal.measure.kinds.position import Position, name_point
 from loopcal.measure.measurements import Measurements
 from loopcal.mechanism.model import Mechanism

@@ -11,6 +11,7 @@ See docs/theory/uncertainty.md.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
@@ -33,7 +34,6 @@ from loopcal.estimate.resampling import repeat_trial, resample_rows
 from loopcal.estimate.residual_test import LEVEL, coverage_factor
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
-from loopcal.frozen_dataclass import dataclass
 from loopcal.measure.measurements import Measurements
 from loopcal.numerics.decomposition import Decomposition
 from loopcal.results.description import Field, fields, label_axes

@@ -17,6 +17,7 @@ Source: Durbin and Watson, Testing for serial correlation in least squares regre
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -30,7 +31,6 @@ from loopcal.estimate.linearization import Linearization, PoseSolution
 from loopcal.estimate.problem import Problem
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, Severity, report_finding
-from loopcal.frozen_dataclass import dataclass, replace
 from loopcal.measure.kinds.kind import Kind
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations

@@ -16,6 +16,7 @@ calibration algorithm for a 6-DOF parallel mechanism", section 4.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,7 +27,6 @@ from loopcal.estimate.posterior import combine_degrees
 from loopcal.estimate.result import SMALLEST_EFFECT
 from loopcal.estimate.smooth_errors import SmoothErrors
 from loopcal.findings import report_finding
-from loopcal.frozen_dataclass import dataclass, field, replace
 from loopcal.measure.initial_values import guess_nuisance_values
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.nuisance import NuisanceParameters

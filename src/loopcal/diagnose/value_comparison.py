@@ -17,6 +17,7 @@ directions. No matrix is inverted. See docs/theory/uncertainty.md.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -30,7 +31,6 @@ from loopcal.estimate.residual_test import SIGNIFICANCE
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
 from loopcal.findings.wording import round_to_digits
-from loopcal.frozen_dataclass import dataclass
 from loopcal.geometry import align_point_sets, log_so3
 from loopcal.measure.instrument import make_random_stream
 from loopcal.mechanism.inverse import inverse_trials

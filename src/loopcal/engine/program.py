@@ -14,13 +14,13 @@ length.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from loopcal.frozen_dataclass import dataclass, fields, replace
 from loopcal.typing import FloatArray, IntArray
 
 PITCH, LENGTH = 6, 7

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import cache
 from importlib import import_module
 from importlib.util import find_spec
@@ -32,7 +33,6 @@ from loopcal.engine.program import (
 )
 from loopcal.errors import MissingPackageError
 from loopcal.findings import report_finding
-from loopcal.frozen_dataclass import dataclass, replace
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.version import __version__
 

@@ -10,6 +10,7 @@ makes no progress. See docs/theory/identification.md.
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from functools import cached_property
 from numbers import Integral
 from typing import ClassVar, NamedTuple, Protocol, Self
@@ -20,7 +21,6 @@ from loopcal.engine import fold
 from loopcal.errors import EstimationError
 from loopcal.estimate.linearization import Linearization, Start
 from loopcal.estimate.penalties import Method, decompose_for, fix_penalty
-from loopcal.frozen_dataclass import dataclass, replace
 from loopcal.measure.array_checks import check_type
 from loopcal.numerics.decomposition import RANK_TOLERANCE, Decomposition, solve_regular
 from loopcal.numerics.gauss_newton import ROUNDING, DescentStatus

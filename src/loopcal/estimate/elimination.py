@@ -12,6 +12,7 @@ nuisance parameter is one more row. See docs/theory/identification.md.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -19,7 +20,6 @@ import numpy as np
 from loopcal import engine
 from loopcal.estimate.linearization import KindRows
 from loopcal.estimate.observation_rows import ObservationRows
-from loopcal.frozen_dataclass import dataclass, replace
 from loopcal.measure.nuisance import NuisanceParameters
 from loopcal.numerics.elimination import (
     EliminationTree,

@@ -20,6 +20,7 @@ give (A'WA)^-1 = (A'A)^-1 / mean w, for unit noise. See docs/theory/uncertainty.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -39,7 +40,6 @@ from loopcal.estimate.problem import Problem, make_exact_problem
 from loopcal.estimate.residual_test import SIGNIFICANCE
 from loopcal.estimate.result import Identification, add_covariance
 from loopcal.findings import Finding, report_finding
-from loopcal.frozen_dataclass import dataclass, replace
 from loopcal.measure.kinds.kind import Evaluation
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.nuisance import NuisanceParameters

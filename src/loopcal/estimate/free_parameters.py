@@ -8,13 +8,13 @@ of the result. Where no tolerance is stated, a default one scales the parameter.
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
 from loopcal.estimate.smooth_errors import SmoothErrors
 from loopcal.findings import Finding, Quantity, report_finding
-from loopcal.frozen_dataclass import dataclass, replace
 from loopcal.mechanism.model import Mechanism, ParameterUnits
 from loopcal.mechanism.over_constraint import refuse_free_breaking_parameters
 from loopcal.parameters import Parameter

@@ -10,6 +10,7 @@ each other: threads compute them in any order, with the same numbers to the last
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from numbers import Integral
 from typing import Any, ClassVar
@@ -35,7 +36,6 @@ from loopcal.estimate.residual_test import FEWEST_DEGREES
 from loopcal.estimate.result import Identification
 from loopcal.estimate.unfixed_motions import find_frame_knowledge
 from loopcal.findings import report_finding
-from loopcal.frozen_dataclass import dataclass, replace
 from loopcal.measure.array_checks import check_type
 from loopcal.measure.data_checks import check_actuators, check_types
 from loopcal.measure.measurements import Measurements

@@ -10,6 +10,7 @@ docs/theory/identification.md.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -19,7 +20,6 @@ from loopcal.estimate.linearization import LinearizedPoses, linearize_poses
 from loopcal.estimate.penalties import Method, decompose_for
 from loopcal.estimate.problem import Problem, problem_of
 from loopcal.estimate.unfixed_motions import frame_twists
-from loopcal.frozen_dataclass import dataclass, replace
 from loopcal.measure.initial_values import evaluate_measurements, whiten_rows
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.nuisance import NuisanceParameters

@@ -20,6 +20,7 @@ poses. This module is the only place where poses and rows are linearized.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -28,7 +29,6 @@ from loopcal import engine, geometry
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.observation_rows import ObservationRows
 from loopcal.estimate.smooth_errors import SmoothErrors
-from loopcal.frozen_dataclass import dataclass, field, replace
 from loopcal.measure.kinds.kind import Evaluation
 from loopcal.measure.readings import select_joint_values
 from loopcal.mechanism.actuation import DrivenJoints

@@ -13,12 +13,12 @@ settings.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import ClassVar, Protocol, TypeVar
 
 import numpy as np
 
 from loopcal.errors import DataError, EstimationError
-from loopcal.frozen_dataclass import dataclass
 from loopcal.numerics.distributions import normal_probability
 from loopcal.numerics.statistics import compute_chi_square_quantile
 from loopcal.registry import Registry

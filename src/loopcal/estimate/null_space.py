@@ -8,13 +8,13 @@ robot's file.
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from typing import ClassVar
 
 import numpy as np
 
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.findings import Finding, report_finding
-from loopcal.frozen_dataclass import dataclass, field
 from loopcal.results.description import Field, fields
 from loopcal.results.result import Result
 from loopcal.typing import FloatArray, IntArray

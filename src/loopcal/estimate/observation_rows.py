@@ -4,12 +4,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
-from loopcal.frozen_dataclass import dataclass, field, replace
 from loopcal.measure.kinds.kind import Kind, MeasuredColumns
 from loopcal.measure.measurements import Measurements
 from loopcal.numerics.elimination import find_connected_groups

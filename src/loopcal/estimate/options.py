@@ -11,6 +11,7 @@ from __future__ import annotations
 import dataclasses
 import inspect
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, fields
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -22,7 +23,6 @@ from loopcal.estimate.methods import METHODS, RULES, SETTINGS
 from loopcal.estimate.penalties import Method
 from loopcal.estimate.prior import Prior
 from loopcal.estimate.residual_test import SIGMA_UNCERTAINTY
-from loopcal.frozen_dataclass import dataclass, field, fields
 from loopcal.measure.array_checks import check_type
 from loopcal.measure.nuisance import NuisanceParameters
 from loopcal.numerics.decomposition import RANK_TOLERANCE

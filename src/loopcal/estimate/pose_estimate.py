@@ -9,6 +9,7 @@ the stroke or on another branch than home's, so that nobody takes it for a measu
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,7 +18,6 @@ from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.linearization import PoseEstimates
 from loopcal.estimate.problem import Problem, problem_of
 from loopcal.findings import Finding, Quantity, report_finding
-from loopcal.frozen_dataclass import dataclass, replace
 from loopcal.geometry import wrap_angle
 from loopcal.measure.data_checks import find_outside_strokes
 from loopcal.measure.measurements import Measurements

@@ -22,6 +22,7 @@ poses that rows link, so that their coordinates are eliminated together.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from operator import itemgetter
 
@@ -52,7 +53,6 @@ from loopcal.estimate.linearization import (
 from loopcal.estimate.observation_rows import ObservationRows, consecutive_pairs
 from loopcal.estimate.pose_coordinates import PoseCoordinates
 from loopcal.findings import report_finding
-from loopcal.frozen_dataclass import dataclass
 from loopcal.mechanism.actuation import drive_joints
 from loopcal.mechanism.kinematics import find_wrong_rows, is_square
 from loopcal.mechanism.sensitivity import fold_pose_rows

@@ -9,6 +9,7 @@ docs/theory/uncertainty.md.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import ClassVar, NamedTuple
 
 import numpy as np
@@ -20,7 +21,6 @@ from loopcal.estimate.residual_test import FEWEST_DEGREES, ResidualTest
 from loopcal.estimate.smooth_errors import SmoothErrors
 from loopcal.findings import report_finding
 from loopcal.findings.wording import round_to_digits
-from loopcal.frozen_dataclass import dataclass, field, replace
 from loopcal.measure.fitted_rows import FittedRows, fitted_rows_from_arrays
 from loopcal.measure.kinds.setup_parameters import POSITION_AXES, ROTATION_AXES, linearize_frame
 from loopcal.mechanism.model import Mechanism

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from copy import copy
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -22,7 +23,6 @@ from loopcal.estimate.linearization import Linearization, Start
 from loopcal.estimate.posterior import Posterior
 from loopcal.estimate.problem import Problem
 from loopcal.findings import report_finding
-from loopcal.frozen_dataclass import dataclass, replace
 from loopcal.measure.array_checks import check_type
 from loopcal.measure.fitted_rows import FittedRows
 from loopcal.measure.measurements import Measurements

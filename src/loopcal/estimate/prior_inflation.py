@@ -28,6 +28,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -52,7 +53,6 @@ from loopcal.estimate.tolerance_components import (
     list_shifts,
 )
 from loopcal.findings import Finding, report_finding
-from loopcal.frozen_dataclass import dataclass, replace
 from loopcal.numerics.decomposition import Decomposition, decompose
 from loopcal.numerics.gauss_newton import DescentStatus
 from loopcal.numerics.statistics import (

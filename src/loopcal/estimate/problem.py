@@ -24,6 +24,7 @@ exactly the gaps that were recorded (`ConsistentPoses`).
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -55,7 +56,6 @@ from loopcal.estimate.pose_coordinates import (
     TwistCoordinates,
 )
 from loopcal.estimate.pose_rows import BLOCK, PoseBlock, PoseRows, find_components
-from loopcal.frozen_dataclass import dataclass, replace
 from loopcal.measure.initial_values import guess_nuisance_values_batch
 from loopcal.measure.kinds.kind import Evaluation, Kind
 from loopcal.measure.measurements import Measurements, anchor_rows

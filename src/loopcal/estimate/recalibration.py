@@ -9,6 +9,7 @@ that of the clearest of these tests. See docs/theory/uncertainty.md.
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Any, ClassVar, NamedTuple
 
@@ -24,7 +25,6 @@ from loopcal.estimate.prior import Prior, limb_parameters, prior_from
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
 from loopcal.findings.catalog.phrases import MACHINE
-from loopcal.frozen_dataclass import dataclass, replace
 from loopcal.measure.data_checks import check_types
 from loopcal.measure.instrument import make_random_stream
 from loopcal.measure.measurements import Measurements

@@ -10,6 +10,7 @@ a prior is an observation, too, and its error is drawn from its stated distribut
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -19,7 +20,6 @@ from loopcal.estimate.linearization import Linearization, Start
 from loopcal.estimate.penalties import decompose_for
 from loopcal.estimate.problem import Problem
 from loopcal.estimate.result import Identification
-from loopcal.frozen_dataclass import dataclass, replace
 from loopcal.numerics.gauss_newton import DescentStatus
 from loopcal.numerics.trial_batch import TrialBatch, map_arrays
 from loopcal.typing import BoolArray, FloatArray, IntArray

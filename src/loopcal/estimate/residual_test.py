@@ -22,13 +22,13 @@ docs/theory/uncertainty.md.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from loopcal.estimate.false_alarms import FALSE_ALARMS
 from loopcal.findings import Finding, Severity, report_finding
-from loopcal.frozen_dataclass import dataclass, replace
 from loopcal.numerics.decomposition import Decomposition
 from loopcal.numerics.distributions import normal_quantile, student_quantile
 from loopcal.numerics.statistics import compute_chi_square_tail, compute_f_tail

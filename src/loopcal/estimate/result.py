@@ -23,6 +23,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -38,7 +39,6 @@ from loopcal.estimate.penalties import Method, Regularization
 from loopcal.estimate.posterior import NOISE, CovariancePart, Posterior, combine_degrees
 from loopcal.estimate.residual_test import LEVEL, ResidualTest, coverage_factor
 from loopcal.findings import Finding, report_finding
-from loopcal.frozen_dataclass import dataclass, field, replace
 from loopcal.measure.kinds.setup_parameters import ROTATION_AXES
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.nuisance import choose_setup_unit

@@ -17,10 +17,11 @@ Gaussian Processes for Machine Learning, 2006, sections 2.2 and 8.1.
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+
 import numpy as np
 
 from loopcal import geometry
-from loopcal.frozen_dataclass import dataclass, replace
 from loopcal.numerics.statistics import compute_median
 from loopcal.typing import FloatArray, IntArray
 

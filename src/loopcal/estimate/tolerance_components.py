@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import string
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import ClassVar, Literal, get_args
 
 import numpy as np
@@ -22,7 +23,6 @@ import numpy as np
 from loopcal.errors import EstimationError
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.residual_test import SIGNIFICANCE
-from loopcal.frozen_dataclass import dataclass
 from loopcal.numerics.decomposition import Decomposition
 from loopcal.numerics.statistics import compute_chi_square_tail
 from loopcal.typing import BoolArray, FloatArray

@@ -4,11 +4,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
 from loopcal.findings.wording import Quantity as Quantity
-from loopcal.frozen_dataclass import dataclass
 from loopcal.plain_text import escape
 
 

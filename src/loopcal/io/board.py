@@ -9,12 +9,12 @@ inner corners have the numbers of the kind `image`: from the top left along the 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from loopcal.environment import import_optional
 from loopcal.errors import DataError
-from loopcal.frozen_dataclass import dataclass
 from loopcal.io.core.records import read_record
 from loopcal.io.core.yaml_file import format_yaml, read_yaml
 from loopcal.io.robot.robot_file import check_format

@@ -7,6 +7,7 @@ import base64
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,6 @@ import numpy as np
 from loopcal.environment import import_optional
 from loopcal.errors import DataError, FileError
 from loopcal.findings import Finding, report_finding
-from loopcal.frozen_dataclass import dataclass, field, replace
 from loopcal.io.board import Board, load_dictionary
 from loopcal.io.core.csv_table import format_row, read_table
 from loopcal.io.core.limits import make_name

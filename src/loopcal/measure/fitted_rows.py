@@ -10,11 +10,11 @@ noise.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
-from loopcal.frozen_dataclass import dataclass
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.repeats import find_steps
 from loopcal.numerics.distributions import binomial_tail

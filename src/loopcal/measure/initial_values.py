@@ -11,12 +11,12 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
 from loopcal.errors import DataError
-from loopcal.frozen_dataclass import replace
 from loopcal.measure.kinds.kind import Kind
 from loopcal.measure.kinds.position import Position
 from loopcal.measure.kinds.setup_parameters import shorten_rotations

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, ClassVar, Self
 
@@ -12,7 +13,6 @@ from numpy.typing import ArrayLike
 
 from loopcal.errors import DataError
 from loopcal.findings import report_finding
-from loopcal.frozen_dataclass import dataclass, field, replace
 from loopcal.measure.array_checks import (
     check_array,
     check_seed,

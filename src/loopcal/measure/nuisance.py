@@ -9,13 +9,13 @@ Kinds that use the same name share the parameter.
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from typing import TYPE_CHECKING, Literal, Self
 
 import numpy as np
 
 from loopcal.errors import DataError, suggest_names
-from loopcal.frozen_dataclass import dataclass, replace
 from loopcal.measure.kinds.kind import Kind
 from loopcal.measure.observations import Observations, StatedSize
 from loopcal.mechanism.model import Mechanism

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, field, replace
 from datetime import date
 from typing import Any, NamedTuple, Self
 
@@ -13,7 +13,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from loopcal.errors import DataError
 from loopcal.findings import Finding, report_finding
-from loopcal.frozen_dataclass import dataclass, field, replace
 from loopcal.measure.array_checks import (
     broadcast_array,
     check_array,

@@ -8,6 +8,7 @@ the true machine turns readings into true poses. The instrument measures these p
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import get_args
 
 import numpy as np
@@ -16,7 +17,6 @@ from numpy.typing import ArrayLike
 from loopcal.engine import State
 from loopcal.errors import DataError
 from loopcal.findings import report_finding
-from loopcal.frozen_dataclass import dataclass, replace
 from loopcal.measure.array_checks import check_array, check_type
 from loopcal.measure.data_checks import check_closure, check_kinds
 from loopcal.measure.initial_values import EvaluatedRows, evaluate_measurements

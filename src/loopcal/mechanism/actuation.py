@@ -3,13 +3,13 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
 from loopcal import engine
 from loopcal.engine import Program, State
-from loopcal.frozen_dataclass import dataclass, replace
 from loopcal.mechanism.limb_rows import (
     differentiate_displacements,
     divide_limbs,

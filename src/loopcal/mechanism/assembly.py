@@ -7,6 +7,7 @@ Every family expands into an `Assembly`; `compilation.build` compiles it for the
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import NamedTuple
 
@@ -14,7 +15,6 @@ import numpy as np
 
 from loopcal import engine
 from loopcal.errors import MechanismError
-from loopcal.frozen_dataclass import dataclass, field
 from loopcal.parameters import CommonError, Parameter
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension

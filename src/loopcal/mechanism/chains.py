@@ -9,6 +9,7 @@ omega = R_s omega_s, v = R_s v_s + omega x (p_end - p_s). Derivation: docs/theor
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -16,7 +17,6 @@ from numpy.typing import NDArray
 
 from loopcal import geometry
 from loopcal.engine import CONVERGED, EXHAUSTED, NOT_FINITE, STALLED, State
-from loopcal.frozen_dataclass import dataclass
 from loopcal.mechanism.model import Mechanism, Stage
 from loopcal.typing import FloatArray, IntArray
 

@@ -11,6 +11,7 @@ docs/theory/kinematics.md.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -18,7 +19,6 @@ from numpy.typing import NDArray
 
 from loopcal import engine, geometry
 from loopcal.engine import BASE, CONVERGED, EXHAUSTED, NOT_FINITE, PITCH, PLATFORM, STALLED, State
-from loopcal.frozen_dataclass import dataclass, replace
 from loopcal.mechanism.actuation import OpenSums, list_open_sums, scale_sums
 from loopcal.mechanism.chains import (
     find_carrying_actuators,

@@ -9,6 +9,7 @@ Source: docs/theory/kinematics.md.
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -16,7 +17,6 @@ from numpy.typing import NDArray
 
 from loopcal import engine, geometry
 from loopcal.engine import State
-from loopcal.frozen_dataclass import dataclass, replace
 from loopcal.mechanism.actuation import ITERATIONS, DrivenJoints, drive_joints, scale_sums
 from loopcal.mechanism.chains import ChainState, each_stage, join_stage_states, locate_stage_bases
 from loopcal.mechanism.limb_rows import follow_limb

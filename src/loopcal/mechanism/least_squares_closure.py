@@ -19,12 +19,12 @@ docs/theory/kinematics.md.
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from loopcal import engine, geometry
 from loopcal.engine import ParameterMap, Program, State
-from loopcal.frozen_dataclass import dataclass, replace
 from loopcal.mechanism.limb_rows import expand_map, follow_limb, measure_rod
 from loopcal.mechanism.states import make_start
 from loopcal.typing import FloatArray

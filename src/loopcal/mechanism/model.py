@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, ClassVar, NamedTuple
 
@@ -13,7 +14,6 @@ from numpy.typing import ArrayLike
 from loopcal.engine import MapPattern, ParameterMap, Program, State
 from loopcal.errors import MechanismError, suggest_names
 from loopcal.findings import Finding, Quantity
-from loopcal.frozen_dataclass import dataclass, replace
 from loopcal.mechanism.assembly import FORCES, Actuator, Assembly, SharedMap, is_serial
 from loopcal.mechanism.transmission import (
     LOAD,

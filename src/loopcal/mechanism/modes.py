@@ -10,6 +10,7 @@ mode was reached. Derivation: docs/theory/kinematics.md.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,7 +18,6 @@ from numpy.typing import ArrayLike
 from loopcal import geometry
 from loopcal.engine import State
 from loopcal.errors import DataError, MechanismError
-from loopcal.frozen_dataclass import dataclass, replace
 from loopcal.mechanism.assembly import BASE
 from loopcal.mechanism.chains import has_spare_drives, join_stage_states
 from loopcal.mechanism.inverse import inverse_trials

@@ -14,6 +14,7 @@ independently. Derivation: docs/theory/kinematics.md.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -23,7 +24,6 @@ from loopcal import engine
 from loopcal.engine import State
 from loopcal.errors import DataError
 from loopcal.findings import Finding, report_finding
-from loopcal.frozen_dataclass import dataclass, replace
 from loopcal.mechanism.actuation import differentiate_unknowns_by_sums
 from loopcal.mechanism.assembly import AXES
 from loopcal.mechanism.chains import find_carrying_actuators, split_stage_states, transport_to_end

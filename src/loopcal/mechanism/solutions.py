@@ -8,6 +8,7 @@ docs/theory/kinematics.md.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, ClassVar
 
@@ -18,7 +19,6 @@ from loopcal import engine, geometry
 from loopcal.engine import NEAR_GOAL, State
 from loopcal.errors import DataError
 from loopcal.findings import Finding, Quantity, report_finding
-from loopcal.frozen_dataclass import dataclass, replace
 from loopcal.mechanism.assembly import AXES, TWIST_UNITS
 from loopcal.mechanism.chains import split_stage_states
 from loopcal.mechanism.inverse import (

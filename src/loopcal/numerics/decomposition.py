@@ -11,12 +11,12 @@ See docs/theory/identification.md.
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
 from loopcal import engine
-from loopcal.frozen_dataclass import dataclass, replace
 from loopcal.numerics.trial_batch import TrialBatch
 from loopcal.typing import BoolArray, FloatArray, IntArray
 

@@ -13,6 +13,7 @@ over a whole cluster. See docs/theory/identification.md.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import permutations
 from typing import ClassVar
@@ -20,7 +21,6 @@ from typing import ClassVar
 import numpy as np
 
 from loopcal import engine
-from loopcal.frozen_dataclass import dataclass
 from loopcal.numerics.decomposition import NUISANCE_TOLERANCE, NULL_COMPONENT, empty_factor
 from loopcal.numerics.statistics import find_distinct
 from loopcal.numerics.trial_batch import TrialBatch

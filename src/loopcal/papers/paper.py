@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from importlib import import_module
 from importlib.resources import files
 from pathlib import Path
@@ -22,7 +23,6 @@ from loopcal.errors import DataError, MechanismError, suggest_names
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.findings import report_finding
 from loopcal.findings.wording import list_names, round_to_digits
-from loopcal.frozen_dataclass import dataclass
 from loopcal.io.robot.robot_file import find_robot_file, load_robot
 from loopcal.mechanism.workspace import list_tilt_rings
 

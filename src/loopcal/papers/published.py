@@ -23,6 +23,7 @@ Braces hold numbers in the formats of `loopcal.findings.wording`.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from decimal import Decimal
 from functools import cache, cached_property
 from pathlib import Path
@@ -31,7 +32,6 @@ from typing import Any
 import numpy as np
 
 from loopcal.findings.wording import fill_template
-from loopcal.frozen_dataclass import dataclass, field
 from loopcal.studies.results.study_result import Interval, compute_binomial_interval
 from loopcal.typing import BoolArray, FloatArray
 

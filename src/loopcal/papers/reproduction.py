@@ -11,12 +11,12 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from io import StringIO
 from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from loopcal.frozen_dataclass import dataclass
 from loopcal.io.core.outputs import FolderKind, write_result_folder
 from loopcal.io.core.text_file import to_json
 from loopcal.papers.published import Comparison, Figure, Table, Verdict

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -17,7 +18,6 @@ from numpy.typing import NDArray
 from loopcal.checks import NOT_NEGATIVE, POSITIVE, Limit, Limited
 from loopcal.errors import DataError
 from loopcal.findings import report_finding
-from loopcal.frozen_dataclass import dataclass, field
 from loopcal.measure.array_checks import check_array
 from loopcal.measure.measurements import Measurements
 from loopcal.mechanism.model import Mechanism

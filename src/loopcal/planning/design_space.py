@@ -9,6 +9,7 @@ are removed once, by a stated tolerance, for all designs alike. See docs/theory/
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from functools import cached_property
 from math import prod
 from typing import Literal
@@ -19,7 +20,6 @@ from numpy.typing import ArrayLike
 from loopcal import engine
 from loopcal.errors import EstimationError
 from loopcal.findings import report_finding
-from loopcal.frozen_dataclass import dataclass, replace
 from loopcal.numerics.decomposition import RANK_TOLERANCE, are_nonzero
 from loopcal.numerics.elimination import eliminate_from_triangle
 from loopcal.typing import BoolArray, FloatArray, IntArray

@@ -35,13 +35,13 @@ accept an exchange only if the new score is larger.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from loopcal.errors import EstimationError
 from loopcal.findings import report_finding
-from loopcal.frozen_dataclass import dataclass, replace
 from loopcal.planning.design_space import (
     Criterion,
     DesignProblem,

@@ -16,13 +16,13 @@ plan. Where no straight path is allowed between two poses, the path goes via hom
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import dataclass
 
 import numpy as np
 
 from loopcal import geometry
 from loopcal.errors import MechanismError
 from loopcal.findings import report_finding
-from loopcal.frozen_dataclass import dataclass
 from loopcal.mechanism.chains import has_spare_drives
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import TILT, list_dimensions, read_coordinates

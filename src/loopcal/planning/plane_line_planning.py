@@ -10,6 +10,7 @@ and docs/theory/planning.md.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, ClassVar
 
@@ -20,7 +21,6 @@ from loopcal.checks import NOT_NEGATIVE, POSITIVE, Limit, Limited
 from loopcal.errors import EstimationError
 from loopcal.estimate.free_parameters import FreeParameters, select_free_parameters
 from loopcal.findings import Finding, report_finding
-from loopcal.frozen_dataclass import dataclass, field
 from loopcal.measure.instrument import Gaussian, Instrument, Noise, Sensor
 from loopcal.measure.kinds.surfaces import Line, Plane
 from loopcal.mechanism.model import Mechanism

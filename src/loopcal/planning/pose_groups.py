@@ -18,6 +18,7 @@ candidate pairs. Derivations: docs/theory/identification.md, docs/theory/plannin
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 from itertools import combinations
 from math import comb
 
@@ -30,7 +31,6 @@ from loopcal.estimate.information import ObservedPoses, observe_poses, observe_r
 from loopcal.estimate.linearization import PoseStates
 from loopcal.estimate.pose_coordinates import TwistCoordinates
 from loopcal.estimate.unfixed_motions import unfixed_motions
-from loopcal.frozen_dataclass import dataclass, replace
 from loopcal.measure.instrument import Gaussian, Instrument, Sensor
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.nuisance import NuisanceParameters, collect_nuisance_parameters

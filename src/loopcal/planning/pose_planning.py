@@ -9,6 +9,7 @@ docs/theory/planning.md.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -19,7 +20,6 @@ from loopcal.errors import EstimationError
 from loopcal.estimate.null_space import describe_null_space
 from loopcal.findings import Finding, Quantity, report_finding
 from loopcal.findings.wording import round_to_digits
-from loopcal.frozen_dataclass import dataclass, replace
 from loopcal.measure.instrument import Instrument
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import list_dimensions

@@ -13,6 +13,7 @@ docs/theory/observability.md, docs/theory/planning.md.
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import ClassVar
 
@@ -35,7 +36,6 @@ from loopcal.estimate.posterior import SAME_MOTION
 from loopcal.estimate.problem import problem_of
 from loopcal.estimate.unfixed_motions import find_frame_knowledge
 from loopcal.findings import Finding, Quantity, report_finding
-from loopcal.frozen_dataclass import dataclass, field, replace
 from loopcal.measure.array_checks import check_type
 from loopcal.measure.data_checks import check_actuators, check_closure
 from loopcal.measure.instrument import Instrument

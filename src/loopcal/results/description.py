@@ -8,13 +8,13 @@ follow from them.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from dataclasses import fields as dataclass_fields
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
-from loopcal.frozen_dataclass import dataclass, replace
 from loopcal.units import SI_SYMBOLS, Dimension
 
 OTHER = "other"

@@ -8,12 +8,12 @@ import io
 import math
 import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import zip_longest
 from types import MappingProxyType
 from typing import Any, Literal, TypeVar
 
 from loopcal.findings.wording import choose_symbol, count_decimals, write_small
-from loopcal.frozen_dataclass import dataclass
 from loopcal.plain_text import escape
 from loopcal.results.description import Field, look_up
 from loopcal.units import UNITS, Dimension, Unit

@@ -10,13 +10,13 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, suppress
+from dataclasses import dataclass
 from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
 from loopcal.checks import POSITIVE, Limit, Limited
 from loopcal.environment import import_optional, pin_processes
 from loopcal.errors import StudyError
 from loopcal.findings import report_finding
-from loopcal.frozen_dataclass import dataclass
 
 MOST_LOSSES = 5
 """Workers that one task may stop. After that it is given up, because it stops any worker."""

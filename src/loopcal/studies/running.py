@@ -11,6 +11,7 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -23,7 +24,6 @@ from loopcal.apply.calibration_report import CalibrationReport
 from loopcal.estimate.identification import check_threads
 from loopcal.findings import Finding, report_finding
 from loopcal.findings.wording import name_count
-from loopcal.frozen_dataclass import dataclass
 from loopcal.io.core.outputs import FolderKind, refuse_folder, write_result_folder
 from loopcal.io.core.text_file import as_path
 from loopcal.io.data.measurement_writer import format_measurements

@@ -16,6 +16,7 @@ are refused only where one of them fits far better: see docs/theory/residual-pat
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -45,7 +46,6 @@ from loopcal.errors import DataError
 from loopcal.estimate.free_parameters import FreeParameters, select_free_parameters
 from loopcal.findings import Finding, Severity, report_finding
 from loopcal.findings.wording import round_to_digits
-from loopcal.frozen_dataclass import dataclass, replace
 from loopcal.measure.data_checks import (
     check_actuators,
     check_targets_move,

@@ -9,6 +9,7 @@ of the setup items that are known.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import chain, combinations, permutations
 from typing import Any
@@ -17,7 +18,6 @@ import numpy as np
 
 from loopcal import geometry
 from loopcal.findings import Finding, report_finding
-from loopcal.frozen_dataclass import dataclass, replace
 from loopcal.geometry import OrientationForm, parse_orientation
 from loopcal.measure.kinds.kind import Kind
 from loopcal.measure.kinds.poses import Component, Pose

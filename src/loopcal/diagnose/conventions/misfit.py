@@ -9,6 +9,7 @@ its own excluded rows. All functions are pure; see docs/theory/residual-patterns
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -26,7 +27,6 @@ from loopcal.estimate.penalties import Ridge
 from loopcal.estimate.problem import Problem, make_exact_problem, make_problem, problem_of
 from loopcal.estimate.resampling import CenteredProblem
 from loopcal.findings import Quantity
-from loopcal.frozen_dataclass import dataclass, replace
 from loopcal.measure.initial_values import guess_nuisance_values_batch
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.nuisance import NuisanceParameters

@@ -10,6 +10,7 @@ is. Derivation: docs/theory/kinematics.md.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
 from functools import reduce
 from typing import Any, NamedTuple
 
@@ -54,7 +55,6 @@ from loopcal.engine.program import (
     Sums,
     Task,
 )
-from loopcal.frozen_dataclass import dataclass, fields, replace
 from loopcal.typing import BoolArray, FloatArray
 
 # --- Solve closure limb by limb where the platform is given, in closed form.

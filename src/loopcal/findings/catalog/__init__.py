@@ -18,6 +18,7 @@ from __future__ import annotations
 import re
 import tomllib
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from functools import cache
 from importlib import import_module
 from pathlib import Path
@@ -25,7 +26,6 @@ from typing import Any
 
 from loopcal.findings import Severity
 from loopcal.findings.wording import Quantity, depends_on_data, fill_template, list_fields
-from loopcal.frozen_dataclass import dataclass, field
 
 FILES: Mapping[str, tuple[str, ...]] = {
     "workflow": ("gates", "workflow"),

@@ -17,6 +17,7 @@ from array import array
 from bisect import bisect_right
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
 from functools import cache
 from itertools import accumulate, chain, takewhile
@@ -27,7 +28,6 @@ import numpy as np
 
 from loopcal.errors import FileError, UnitError, suggest_names
 from loopcal.findings import Finding, report_finding
-from loopcal.frozen_dataclass import dataclass
 from loopcal.io.core.limits import (
     LINE_LENGTH,
     LONGEST_COMPOSED,

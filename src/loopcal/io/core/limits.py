@@ -11,12 +11,12 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
 from loopcal.errors import FileError
 from loopcal.findings import Finding, report_finding
-from loopcal.frozen_dataclass import dataclass
 from loopcal.mechanism.assembly import (
     MOST_ACTUATORS,
     MOST_COPIES,

@@ -9,13 +9,13 @@ import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, suppress
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 from loopcal.errors import FileError, UnitError, suggest_names
 from loopcal.findings import Finding, report_finding
-from loopcal.frozen_dataclass import dataclass, replace
 from loopcal.io.core.limits import YAML_DEPTH, YAML_NODES, YAML_SIZE, FileLimit, find_fault_below
 from loopcal.io.core.text_file import as_path, read_text
 from loopcal.plain_text import escape, quote

@@ -12,6 +12,7 @@ import re
 import unicodedata
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from itertools import permutations
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -20,7 +21,6 @@ import numpy as np
 
 from loopcal.errors import suggest_names
 from loopcal.findings import Finding, report_finding
-from loopcal.frozen_dataclass import dataclass, field
 from loopcal.io.core.csv_table import (
     NAME_COLUMNS,
     Table,

@@ -23,7 +23,7 @@ import types
 import typing
 import unicodedata
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import make_dataclass
+from dataclasses import dataclass, make_dataclass, replace
 from fnmatch import fnmatchcase
 from functools import cache, reduce
 from typing import (
@@ -44,7 +44,6 @@ from numpy.typing import NDArray
 from loopcal import geometry
 from loopcal.errors import DataError, suggest_names
 from loopcal.findings import report_finding
-from loopcal.frozen_dataclass import dataclass, replace
 from loopcal.io.core.csv_table import Places, Table, format_scaled, require_columns
 from loopcal.io.core.records import get_field_types, read_record
 from loopcal.io.core.text_file import name_files

@@ -16,6 +16,7 @@ files has the same readings in both.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
@@ -24,7 +25,6 @@ import numpy as np
 from loopcal.errors import DataError, FileError, suggest_names
 from loopcal.estimate.determinable_setup import fix_undetermined_setup
 from loopcal.findings import Finding, report_finding
-from loopcal.frozen_dataclass import dataclass, replace
 from loopcal.io.core.csv_table import Places, Table, read_table, read_template, require_columns
 from loopcal.io.core.text_file import as_path, name_files
 from loopcal.io.core.yaml_file import find_reference

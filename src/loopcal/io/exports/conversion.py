@@ -15,6 +15,7 @@ from __future__ import annotations
 import csv
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from datetime import datetime
 from decimal import Decimal
 from pathlib import Path
@@ -25,7 +26,6 @@ import numpy as np
 from loopcal import geometry
 from loopcal.errors import FileError, suggest_names
 from loopcal.findings import Finding, report_finding
-from loopcal.frozen_dataclass import dataclass
 from loopcal.io.core.csv_table import (
     NAME_COLUMNS,
     format_header,

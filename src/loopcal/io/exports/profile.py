@@ -9,6 +9,7 @@ import re
 import time
 import unicodedata
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import cached_property
 from importlib import resources
@@ -20,7 +21,6 @@ import regex
 
 from loopcal.errors import FileError, UnitError, suggest_names
 from loopcal.findings import report_finding
-from loopcal.frozen_dataclass import dataclass, field, replace
 from loopcal.io.core.csv_table import format_scaled, parse_finite
 from loopcal.io.core.limits import PATTERN_COUNTS, PATTERN_LENGTH, PATTERN_SECONDS
 from loopcal.io.core.records import read_record

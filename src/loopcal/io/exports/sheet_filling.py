@@ -10,11 +10,11 @@ is written, the points are to be examined: `loopcal.diagnose.point_names.examine
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from loopcal.errors import FileError
 from loopcal.findings import Finding, report_finding
-from loopcal.frozen_dataclass import dataclass, replace
 from loopcal.io.core.csv_table import (
     Cells,
     Table,

@@ -22,6 +22,7 @@ import math
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import reduce
 from operator import xor
 from pathlib import Path
@@ -29,7 +30,6 @@ from typing import Any, ClassVar
 
 from loopcal.errors import FileError
 from loopcal.findings import Finding, report_finding
-from loopcal.frozen_dataclass import dataclass
 from loopcal.io.core.text_file import read_text
 from loopcal.io.core.yaml_file import format_yaml
 from loopcal.io.formats.probe_reports import import_probes

@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,6 @@ import numpy as np
 
 from loopcal.errors import DataError, FileError
 from loopcal.findings import Finding, Quantity, report_finding
-from loopcal.frozen_dataclass import dataclass
 from loopcal.io.core.text_file import read_json
 from loopcal.io.core.yaml_file import format_yaml
 from loopcal.io.formats.program_format import (

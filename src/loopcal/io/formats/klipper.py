@@ -17,13 +17,13 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from loopcal.errors import FileError
 from loopcal.findings import Quantity, report_finding
-from loopcal.frozen_dataclass import dataclass
 from loopcal.io.core.csv_table import parse_finite
 from loopcal.io.formats.delta_gcode import (
     NOMINAL_ANGLES,

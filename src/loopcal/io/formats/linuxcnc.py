@@ -20,6 +20,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -27,7 +28,6 @@ import numpy as np
 
 from loopcal.errors import DataError, FileError
 from loopcal.findings import Finding, report_finding
-from loopcal.frozen_dataclass import dataclass
 from loopcal.io.core.csv_table import format_scaled
 from loopcal.io.core.yaml_file import format_yaml
 from loopcal.io.formats.program_format import (

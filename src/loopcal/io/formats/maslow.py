@@ -12,6 +12,7 @@ Maslow (print_calibration_data and measurementToXYPlane in Maslow.cpp, maslow.ya
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -19,7 +20,6 @@ import numpy as np
 
 from loopcal.errors import DataError, FileError
 from loopcal.findings import Quantity, report_finding
-from loopcal.frozen_dataclass import dataclass
 from loopcal.io.core.text_file import read_text
 from loopcal.io.core.yaml_file import format_yaml
 from loopcal.io.formats.program_format import (

@@ -10,6 +10,7 @@ import math
 import re
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
@@ -19,7 +20,6 @@ from numpy.typing import ArrayLike
 from loopcal.errors import DataError, FileError
 from loopcal.findings import Finding, report_finding
 from loopcal.findings.wording import count_decimals
-from loopcal.frozen_dataclass import dataclass, field, replace
 from loopcal.io.core.csv_table import parse_finite
 from loopcal.io.core.limits import format_comment
 from loopcal.io.core.text_file import read_bytes, read_text

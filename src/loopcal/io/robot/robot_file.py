@@ -21,7 +21,7 @@ import re
 import textwrap
 import types
 from collections.abc import Mapping, Sequence
-from dataclasses import MISSING
+from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_origin
 
@@ -29,7 +29,6 @@ import numpy as np
 
 from loopcal.errors import DataError, FileError, MechanismError, UnitError, suggest_names
 from loopcal.findings import report_finding
-from loopcal.frozen_dataclass import dataclass, fields
 from loopcal.io.core.csv_table import format_scaled
 from loopcal.io.core.records import Units, get_field_types, read_record, read_units
 from loopcal.io.core.text_file import as_path, name_files, write_text

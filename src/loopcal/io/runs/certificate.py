@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -21,7 +22,6 @@ import numpy as np
 
 from loopcal.errors import DataError
 from loopcal.findings.catalog.phrases import conformity_probability
-from loopcal.frozen_dataclass import dataclass, fields
 from loopcal.io.core.records import read_record
 from loopcal.io.core.yaml_file import Location, name_location, read_yaml
 from loopcal.io.runs.run_folder import refuse_changed_run

@@ -14,6 +14,7 @@ robot.yaml     the corrected robot file: the nominal file plus its `identified:`
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,7 +23,6 @@ import numpy as np
 from loopcal.engine import collect_versions
 from loopcal.errors import DataError, EstimationError, FileError
 from loopcal.findings import Finding, report_finding
-from loopcal.frozen_dataclass import dataclass, field, replace
 from loopcal.io.core.outputs import (
     FolderKind,
     describe_leftover,

@@ -5,13 +5,13 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import cached_property
 from typing import ClassVar, Self
 
 import numpy as np
 
 from loopcal import geometry
-from loopcal.frozen_dataclass import dataclass
 from loopcal.geometry import solve_directions
 from loopcal.measure.array_checks import check_direction, check_pose
 from loopcal.measure.kinds import setup_parameters as setup

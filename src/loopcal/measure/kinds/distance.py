@@ -6,13 +6,13 @@ ball bar.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import cached_property
 from typing import ClassVar, Self
 
 import numpy as np
 
 from loopcal.errors import DataError
-from loopcal.frozen_dataclass import dataclass
 from loopcal.geometry import FLATNESS, solve_trilateration
 from loopcal.measure.array_checks import check_point
 from loopcal.measure.kinds import setup_parameters as setup

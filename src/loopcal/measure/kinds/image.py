@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import ClassVar, Self
 
@@ -11,7 +12,6 @@ import numpy as np
 
 from loopcal import geometry
 from loopcal.errors import DataError
-from loopcal.frozen_dataclass import dataclass, replace
 from loopcal.geometry import align_point_sets, solve_frame_and_points, solve_hand_eye
 from loopcal.measure.array_checks import check_pose, set_fields
 from loopcal.measure.camera_geometry import (

@@ -10,13 +10,13 @@ value that the encoder showed.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import cached_property
 from typing import ClassVar, Self
 
 import numpy as np
 
 from loopcal.errors import DataError
-from loopcal.frozen_dataclass import dataclass
 from loopcal.measure.array_checks import check_names, set_fields
 from loopcal.measure.kinds import CLOSURE
 from loopcal.measure.kinds import setup_parameters as setup

@@ -23,7 +23,7 @@ from __future__ import annotations
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import MISSING, Field
+from dataclasses import MISSING, Field, dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any, ClassVar, NamedTuple, Self, cast
 
@@ -31,7 +31,6 @@ import numpy as np
 
 from loopcal import geometry
 from loopcal.errors import DataError
-from loopcal.frozen_dataclass import dataclass, field, fields, replace
 from loopcal.measure.array_checks import set_fields
 from loopcal.measure.kinds.setup_parameters import SetupItem, encode_frame
 from loopcal.mechanism.chains import name_platform_entries

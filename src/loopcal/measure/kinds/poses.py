@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import ClassVar, Self
 
@@ -11,7 +12,6 @@ import numpy as np
 
 from loopcal import engine, geometry
 from loopcal.errors import DataError
-from loopcal.frozen_dataclass import dataclass, replace
 from loopcal.geometry import OrientationForm, align_point_sets, solve_hand_eye
 from loopcal.measure.array_checks import check_names, check_pose, set_fields
 from loopcal.measure.kinds import setup_parameters as setup

@@ -11,11 +11,11 @@ exactly 180 degrees.
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from loopcal import geometry
-from loopcal.frozen_dataclass import dataclass, field
 from loopcal.geometry import stack_blocks
 from loopcal.parameters import Parameter
 from loopcal.typing import FloatArray

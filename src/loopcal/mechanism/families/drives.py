@@ -9,12 +9,12 @@ mechanism/transmission.py. How to write it: docs/robots.md.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import ClassVar, Literal
 
 import numpy as np
 
 from loopcal.errors import suggest_names
-from loopcal.frozen_dataclass import dataclass, field, replace
 from loopcal.mechanism.assembly import AXES, FORCES, Actuator, Address, Joint, Limb, LinearMap, Load
 from loopcal.mechanism.families.placement import (
     AngleTolerance,

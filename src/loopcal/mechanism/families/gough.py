@@ -9,13 +9,13 @@ Derivation: docs/theory/families.md.
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
 
 from loopcal import geometry
 from loopcal.errors import MechanismError
-from loopcal.frozen_dataclass import dataclass, field
 from loopcal.mechanism.assembly import AXES, Actuator, Assembly, Cone, Joint
 from loopcal.mechanism.families.placement import (
     EZ,

@@ -12,12 +12,12 @@ must close with drawn errors of all parameters. Derivation: docs/theory/kinemati
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from loopcal.errors import MechanismError
 from loopcal.findings import Finding, report_finding
-from loopcal.frozen_dataclass import dataclass, replace
 from loopcal.mechanism.compilation import build
 from loopcal.mechanism.families.limb_records import (
     JointRecord,

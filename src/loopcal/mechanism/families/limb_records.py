@@ -11,11 +11,11 @@ the unit of a number from its annotation.
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
 
-from loopcal.frozen_dataclass import dataclass, field
 from loopcal.mechanism.families.named_parameters import Freedom
 from loopcal.mechanism.families.placement import (
     AngleTolerance,

@@ -9,11 +9,11 @@ repeats. How to write such a file: docs/robots.md.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from loopcal.errors import MechanismError, suggest_names
-from loopcal.frozen_dataclass import dataclass, replace
 from loopcal.geometry import invert_pose
 from loopcal.mechanism.assembly import (
     BASE,

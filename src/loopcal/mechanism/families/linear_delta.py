@@ -10,12 +10,12 @@ point at distance arm_k from all three. Radius and angles are shared parameters
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
 
 from loopcal.errors import MechanismError
-from loopcal.frozen_dataclass import dataclass, field
 from loopcal.geometry import stack_matrix
 from loopcal.mechanism.assembly import Actuator, Address, Assembly, Joint, LinearMap, SharedMap
 from loopcal.mechanism.families.placement import (

@@ -4,12 +4,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
 from loopcal.errors import MechanismError
-from loopcal.frozen_dataclass import dataclass
 from loopcal.mechanism.assembly import AXES, Address, LinearMap
 from loopcal.mechanism.families.drives import PlacedCoupling, PlacedDrive, ScrewDrive, SpoolDrive
 from loopcal.mechanism.families.placement import (

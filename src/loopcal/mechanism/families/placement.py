@@ -7,13 +7,13 @@ Numbers are in SI; `loopcal.io` converts them from the units of the file, by the
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
 from loopcal import geometry
 from loopcal.errors import MechanismError
-from loopcal.frozen_dataclass import dataclass, replace
 from loopcal.mechanism.assembly import (
     AXES,
     BASE,

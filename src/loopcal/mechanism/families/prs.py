@@ -12,13 +12,13 @@ revolute joint on it. Derivation: docs/theory/families.md.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
 
 from loopcal import geometry
 from loopcal.errors import MechanismError
-from loopcal.frozen_dataclass import dataclass, field
 from loopcal.mechanism.assembly import AXES, Actuator, Assembly, Joint
 from loopcal.mechanism.families.placement import (
     EX,

@@ -9,10 +9,10 @@ from __future__ import annotations
 import fnmatch
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
 from typing import ClassVar
 
 from loopcal.errors import MechanismError, suggest_names
-from loopcal.frozen_dataclass import dataclass, field, fields, replace
 from loopcal.mechanism.assembly import FORCES, Actuator, Assembly
 from loopcal.mechanism.families.drives import (
     Condition,

@@ -9,12 +9,12 @@ How to write such a file: docs/robots.md.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import ClassVar, Literal
 
 import numpy as np
 
 from loopcal.errors import MechanismError, suggest_names
-from loopcal.frozen_dataclass import dataclass, field, replace
 from loopcal.mechanism.assembly import (
     AXES,
     BASE,

@@ -3,12 +3,12 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 
 from loopcal import geometry
-from loopcal.frozen_dataclass import dataclass, replace
 from loopcal.mechanism.platform_coordinates import (
     EULER,
     POSITION,

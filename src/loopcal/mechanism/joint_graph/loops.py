@@ -11,6 +11,7 @@ those of the two points and directions, which only the joints below each body mo
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations
 
@@ -19,7 +20,6 @@ import numpy as np
 from loopcal import geometry
 from loopcal.errors import MechanismError
 from loopcal.findings import Quantity, report_finding
-from loopcal.frozen_dataclass import dataclass, replace
 from loopcal.mechanism.joint_graph.graph import GraphJoint, turn_between
 from loopcal.numerics.decomposition import are_nonzero
 from loopcal.typing import BoolArray, FloatArray

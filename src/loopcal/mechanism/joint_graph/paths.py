@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -16,7 +17,6 @@ import numpy as np
 from loopcal import geometry
 from loopcal.errors import MechanismError
 from loopcal.findings import report_finding
-from loopcal.frozen_dataclass import dataclass, replace
 from loopcal.mechanism.assembly import AXES
 from loopcal.mechanism.joint_graph.graph import Coupling, GraphJoint, turn_between
 from loopcal.mechanism.joint_graph.loops import (

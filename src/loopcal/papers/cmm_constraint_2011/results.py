@@ -4,11 +4,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from loopcal.frozen_dataclass import dataclass, replace
 from loopcal.mechanism.platform_coordinates import POSITION as POSITION_AXES
 from loopcal.papers import published
 from loopcal.papers.cmm_constraint_2011 import steps

@@ -10,6 +10,7 @@ drawn, held and calibrated by the cells of a study, see `studies/simulation/bloc
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import groupby
 from time import process_time
@@ -22,7 +23,6 @@ from loopcal.diagnose.identifiable_parameters import identifiability
 from loopcal.estimate.null_space import Combination
 from loopcal.findings import report_finding
 from loopcal.findings.wording import list_names
-from loopcal.frozen_dataclass import dataclass, replace
 from loopcal.measure.instrument import Gaussian
 from loopcal.measure.simulation import sample_truth
 from loopcal.mechanism.kinematics import forward_trials

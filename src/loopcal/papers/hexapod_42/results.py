@@ -4,11 +4,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 
 import numpy as np
 
 from loopcal.findings.wording import fill_template
-from loopcal.frozen_dataclass import dataclass
 from loopcal.papers import published
 from loopcal.papers.hexapod_42 import steps
 from loopcal.papers.hexapod_42.steps import (

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from contextlib import suppress
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -18,7 +19,6 @@ import numpy as np
 import loopcal as lc
 from loopcal import geometry
 from loopcal.errors import DataError, EstimationError
-from loopcal.frozen_dataclass import dataclass, replace
 from loopcal.measure.instrument import make_random_stream
 from loopcal.measure.kinds.poses import Pose
 from loopcal.measure.measurements import Measurements

@@ -12,12 +12,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from loopcal.frozen_dataclass import dataclass
 from loopcal.mechanism.platform_coordinates import POSITION
 from loopcal.papers import published
 from loopcal.papers.paper import StudyCase

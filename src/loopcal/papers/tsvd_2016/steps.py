@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -26,7 +27,6 @@ from loopcal.diagnose.identifiable_parameters import Identifiability
 from loopcal.errors import DataError
 from loopcal.estimate.free_parameters import FreeParameters, select_free_parameters
 from loopcal.estimate.penalties import Method
-from loopcal.frozen_dataclass import dataclass, replace
 from loopcal.measure.instrument import make_random_stream
 from loopcal.measure.kinds.poses import SMALL_TILT, Component
 from loopcal.measure.simulation import Trials, simulate_trials

@@ -9,6 +9,7 @@ from __future__ import annotations
 import base64
 import hashlib
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -21,7 +22,6 @@ from loopcal.apply.verdict import Verdict
 from loopcal.estimate.options import OBJECT, FitOptions
 from loopcal.estimate.posterior import Posterior
 from loopcal.estimate.result import KindResiduals
-from loopcal.frozen_dataclass import dataclass, field
 from loopcal.mechanism.model import Mechanism
 from loopcal.plain_text import escape
 from loopcal.report.scene.scene import load_script

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,7 +14,6 @@ from loopcal.diagnose.cross_validation import RegularizationCurves
 from loopcal.diagnose.identifiable_parameters import Identifiability
 from loopcal.estimate.result import Identification, KindResiduals
 from loopcal.findings.wording import list_names, name_count
-from loopcal.frozen_dataclass import dataclass
 from loopcal.measure.kinds.joints import ActuatorReadings
 from loopcal.mechanism.model import Mechanism
 from loopcal.numerics.distributions import normal_quantile

@@ -11,6 +11,7 @@ import base64
 import json
 import math
 from collections.abc import Iterator
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any, Literal
@@ -19,7 +20,6 @@ import numpy as np
 
 from loopcal.apply.accuracy import AccuracyMap
 from loopcal.engine import State
-from loopcal.frozen_dataclass import dataclass
 from loopcal.mechanism.assembly import BASE, PLATFORM
 from loopcal.mechanism.kinematics import compute_limb_frames, compute_readings, locate_anchors
 from loopcal.mechanism.model import Mechanism

@@ -26,6 +26,7 @@ import sqlite3
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -35,7 +36,6 @@ import numpy as np
 from loopcal.engine import get_current_engine
 from loopcal.errors import FileError, LoopcalError
 from loopcal.findings import report_finding
-from loopcal.frozen_dataclass import dataclass, replace
 from loopcal.io.core.limits import YAML_SIZE
 from loopcal.io.core.outputs import replace_folder
 from loopcal.io.core.replacement import lock, open_folder

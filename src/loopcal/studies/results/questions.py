@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Literal
@@ -23,7 +24,6 @@ import numpy as np
 
 from loopcal.findings import report_finding
 from loopcal.findings.catalog import find_entry
-from loopcal.frozen_dataclass import dataclass
 from loopcal.io.core.text_file import to_json, write_bytes, write_text
 from loopcal.results.tables import ABSENT, Block, Column, Table, format_number, word_column
 from loopcal.studies.files.store import StudyStore

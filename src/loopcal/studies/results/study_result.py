@@ -6,6 +6,7 @@ from __future__ import annotations
 import csv
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,7 +16,6 @@ import numpy as np
 from loopcal.checks import check_choice
 from loopcal.environment import import_optional
 from loopcal.errors import DataError, StudyError
-from loopcal.frozen_dataclass import dataclass
 from loopcal.io.core.text_file import replace_file
 from loopcal.results.result import TableResult
 from loopcal.results.tables import Block, Column, build_table, word_column

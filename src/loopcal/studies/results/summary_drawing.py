@@ -5,13 +5,13 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from loopcal.checks import check_choice
 from loopcal.errors import DataError
-from loopcal.frozen_dataclass import dataclass
 from loopcal.report.figures.style import (
     COLORS,
     GRID,

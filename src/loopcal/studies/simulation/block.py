@@ -6,6 +6,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import groupby
 from typing import Any
@@ -17,7 +18,6 @@ from loopcal.diagnose.error_frames import fit_frames
 from loopcal.errors import DataError
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.unfixed_motions import frame_twists
-from loopcal.frozen_dataclass import dataclass, replace
 from loopcal.measure.instrument import BlockStream, make_random_stream
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.simulation import Trials, simulate_trials

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from contextlib import suppress
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -22,7 +23,6 @@ from loopcal.errors import DataError, EstimationError
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.identification import IdentifiedTrials, identify, identify_trials
 from loopcal.estimate.penalties import Ridge
-from loopcal.frozen_dataclass import dataclass, replace
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.simulation import Trials
 from loopcal.mechanism.kinematics import forward_trials

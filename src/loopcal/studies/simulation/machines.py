@@ -6,6 +6,7 @@ effects and method; a process prepares them once.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,6 @@ from loopcal.estimate.identification import compute_trial_posterior, identify_tr
 from loopcal.estimate.options import FitOptions
 from loopcal.estimate.penalties import MAP, LeastSquares
 from loopcal.estimate.tolerance_components import InflatedTolerances
-from loopcal.frozen_dataclass import dataclass, replace
 from loopcal.io.core.yaml_file import parse_yaml
 from loopcal.io.robot.robot_file import build_robot
 from loopcal.measure.instrument import Instrument, Noise, Seed, Uniform, make_random_stream

@@ -34,6 +34,7 @@ directions. Derivation, and why this equals surfaces as unknowns: docs/theory/co
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Literal, get_args
 
@@ -49,7 +50,6 @@ from loopcal.estimate.penalties import LeastSquares, Method
 from loopcal.estimate.problem import Problem, problem_of_trials
 from loopcal.findings import report_finding
 from loopcal.findings.wording import name_count
-from loopcal.frozen_dataclass import dataclass, field, replace
 from loopcal.measure.instrument import Gaussian, make_random_stream
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations

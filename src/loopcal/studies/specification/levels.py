@@ -8,7 +8,7 @@ are in SI; the reader of study files converts them.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import is_dataclass
+from dataclasses import dataclass, field, fields, is_dataclass
 from typing import (
     TYPE_CHECKING,
     Annotated,
@@ -24,7 +24,6 @@ from loopcal.checks import NOT_NEGATIVE, POSITIVE, Limit, Limited, check_choice,
 from loopcal.estimate.losses import LOSSES
 from loopcal.estimate.methods import METHODS, SETTINGS
 from loopcal.estimate.options import NO_LOSS, Noise
-from loopcal.frozen_dataclass import dataclass, field, fields
 from loopcal.measure.instrument import SIGMA, Distribution
 from loopcal.units import SI_SYMBOLS, Angle, Dimension, Length
 

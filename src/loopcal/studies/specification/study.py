@@ -11,7 +11,7 @@ import itertools
 import json
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import is_dataclass
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import cached_property
 from typing import Any, ClassVar
 
@@ -19,7 +19,6 @@ import msgspec
 
 from loopcal.checks import Limit, Limited, check_choice, whole_numbers
 from loopcal.errors import DataError, UnitError
-from loopcal.frozen_dataclass import dataclass, field, fields, replace
 from loopcal.io.core import limits
 from loopcal.results.result import Result
 from loopcal.studies.specification.levels import (

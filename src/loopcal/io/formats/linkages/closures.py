@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import permutations
 from pathlib import Path
 from typing import Any, Literal
@@ -25,7 +26,6 @@ import numpy as np
 
 from loopcal import geometry
 from loopcal.errors import FileError, MechanismError, suggest_names
-from loopcal.frozen_dataclass import dataclass, field, replace
 from loopcal.io.core.yaml_file import YamlFile, read_yaml, refuse_unknown_keys
 from loopcal.io.formats.linkages.tree import (
     Constraint,

@@ -11,6 +11,7 @@ joint is multiplier (leader - reference) + offset. Source: the specification of 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,6 @@ import numpy as np
 from loopcal import geometry
 from loopcal.errors import FileError, suggest_names
 from loopcal.findings import report_finding
-from loopcal.frozen_dataclass import dataclass, replace
 from loopcal.io.core.text_file import read_text
 from loopcal.io.formats.linkages.linkage_format import make_format
 from loopcal.io.formats.linkages.tree import (

@@ -9,6 +9,7 @@ frame. Lengths are meters, angles radians.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,6 @@ import numpy as np
 
 from loopcal import geometry
 from loopcal.errors import FileError, suggest_names
-from loopcal.frozen_dataclass import dataclass, field, replace
 from loopcal.io.core.limits import XML_JOINTS, find_fault
 from loopcal.io.formats.linkages.xml_tree import Element
 from loopcal.typing import FloatArray
