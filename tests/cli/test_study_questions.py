@@ -62,6 +62,7 @@ def test_a_question_is_asked_after_the_run(loopcal, folder) -> None:
         ("--smallest poses --limit 30", "limit: '30' has no unit"),
         ("--smallest poses --limit 30um --score rank", "score is 'rank'"),
         ("--smallest poses --limit 30um --share 95", "--share"),
+        ("--smallest poses --limit 30um --share nan", "--share"),
     ],
 )
 def test_wrong_questions_get_a_sentence(loopcal, folder, words, sentence) -> None:

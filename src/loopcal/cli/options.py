@@ -239,7 +239,20 @@ GOAL = Parsed("quantity", _parse_goal)
 NAMES = Parsed("names", lambda text: tuple(text.split(",")), ",".join)
 CONDITION = Parsed("condition", _parse_condition)
 POSE_SHARE = Parsed("share", _parse_pose_share)
-SHARE, OPEN_SHARE = (click.FloatRange(0, 1, is_open, is_open) for is_open in (False, True))
+
+
+class NumberRange(click.FloatRange):
+    """A number within a range, which NaN is not."""
+
+    def convert(self, value: Any, param: Any, ctx: Any) -> Any:
+        """Return the number."""
+        number = super().convert(value, param, ctx)
+        if math.isnan(number):
+            self.fail(f"{number} is not in the range {self._describe_range()}.", param, ctx)
+        return number
+
+
+SHARE, OPEN_SHARE = (NumberRange(0, 1, is_open, is_open) for is_open in (False, True))
 SHARE.name = OPEN_SHARE.name = "share"
 
 
@@ -711,7 +724,7 @@ DRAW: Any = option(
 EPSILON: Any = option(
     "End the steps when the largest error of a pose, max dQint = position error [mm] + angle "
     "[rad], is at most this number.",
-    type=click.FloatRange(0, math.inf, min_open=True, max_open=True),
+    type=NumberRange(0, math.inf, min_open=True, max_open=True),
     metavar="NUMBER",
 )
 

@@ -200,7 +200,7 @@ class Problem:
     readings: FloatArray
     trials: IntArray
     data: Callable[[int], Measurements]
-    control: Halving = Halving()
+    control: Halving = Halving()  # noqa: RUF009
     sigma: FloatArray | None = None
     consistent: ConsistentPoses | None = None
 

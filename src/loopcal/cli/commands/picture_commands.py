@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -90,12 +91,15 @@ def photos(
         "What the platform carries.", type=click.Choice(("board", "camera")), default="board"
     ),
     sigma: float = opt.option(
-        "Noise of u and v.", type=click.FloatRange(0.0, min_open=True), default=0.1, metavar="PX"
+        "Noise of u and v.",
+        type=opt.NumberRange(0.0, math.inf, min_open=True, max_open=True),
+        default=0.1,
+        metavar="PX",
     ),
     most_blur: float = opt.option(
         "Blur of edges above which a picture is left out.",
         of="loopcal.io.pictures:BLUR",
-        type=click.FloatRange(0.0, min_open=True),
+        type=opt.NumberRange(0.0, math.inf, min_open=True, max_open=True),
         metavar="PX",
     ),
     workers: int | None = opt.option(
