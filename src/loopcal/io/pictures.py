@@ -46,7 +46,6 @@ class PictureTask:
     path: Path
     board: Board
     most_blur: float = BLUR
-    least_corners: int = LEAST_CORNERS
 
     @property
     def key(self) -> str:
@@ -102,7 +101,7 @@ def examine_picture(task: PictureTask) -> Picture:
     size = gray.shape[1], gray.shape[0]
     corners, pixels = find_corners(cv2, gray, task.board)
     blur = measure_blur(cv2, gray, task.board, corners, pixels)
-    least, fault = min(task.least_corners, task.board.corners[0] * task.board.corners[1]), None
+    least, fault = min(LEAST_CORNERS, task.board.corners[0] * task.board.corners[1]), None
     if len(corners) < least:
         flipped = np.ascontiguousarray(gray[:, ::-1])
         if len(find_corners(cv2, flipped, task.board)[0]) >= least:

@@ -129,6 +129,7 @@ def photos(
     from loopcal.findings import report_finding
     from loopcal.io import pictures as of
     from loopcal.io.board import load_dictionary, read_board
+    from loopcal.io.core.csv_table import refuse_settings_beside
     from loopcal.io.core.outputs import refuse_outputs, restore_on_failure
     from loopcal.io.core.text_file import write_text
     from loopcal.studies.executors import Processes, Serial
@@ -138,6 +139,7 @@ def photos(
     page_file, known = output.with_suffix(".html"), read_board(board)
     paths = of.list_pictures(folder)
     refuse_outputs((output, page_file), (board, poses, *paths), force)
+    refuse_settings_beside(output)
     load_dictionary(import_optional("cv2", "camera"), known)
     if known.measured is None:
         terminal.print_finding("pictures.board-unmeasured")
@@ -163,28 +165,17 @@ def photos(
         write_text(output, text)
         write_text(page_file, of.format_contact_sheet(pictures, names))
     used = [picture for picture in pictures if picture.fault is None]
-    document = {
-        "measurements": output,
-        "sheet": page_file,
-        "used": len(used),
-        "pictures": [
-            {
-                "picture": picture.path,
-                "pose": names[picture.path],
-                "corners": len(picture.corners),
-                "blur": picture.blur,
-                "focal": picture.focal,
-                "fault": picture.fault,
-            }
-            for picture in pictures
-        ],
-    }
+    shown = [
+        {"picture": p.path, "pose": names[p.path], "corners": len(p.corners)}
+        | {"blur": p.blur, "focal": p.focal, "fault": p.fault}
+        for p in pictures
+    ]
+    document = {"measurements": output, "sheet": page_file, "used": len(used), "pictures": shown}
     lines = [f"{picture.path.name}: {of.describe_picture(picture)}" for picture in pictures]
+    files = [] if beside else ["poses.csv"]
     page = [
         "\n".join(lines),
         f"{output}: {len(used)} of {len(pictures)} pictures, {page_file} shows them",
-        suggest_command(
-            "calibrate", "ROBOT", *([] if beside else ["poses.csv"]), output, "-o", "run"
-        ),
+        suggest_command("calibrate", "ROBOT", *files, output, "-o", "run"),
     ]
     return Output(document, lambda: page)
