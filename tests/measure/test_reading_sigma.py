@@ -87,7 +87,7 @@ def test_exact_reading_of_a_redundant_actuator_is_refused():
     exact = replace(data, reading_sigma=np.array([0.0, 1e-3, 1e-3, 1e-3]))
     with pytest.raises(
         DataError,
-        match=r"readings of redundant actuators cannot be exact. Give each a "
+        match=r"Readings of redundant actuators cannot be exact. Give each a "
         r"sigma above 0",
     ) as error:
         identify(robot, exact, LeastSquares())
