@@ -16,6 +16,7 @@ plan. Where no straight path is allowed between two poses, the path goes via hom
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -251,7 +252,7 @@ def _reverse_sections(cost: FloatArray, tour: IntArray) -> tuple[IntArray, bool]
     return tour, False
 
 
-def check_route(robot: Mechanism, labels: tuple[str, ...], coordinates: FloatArray) -> FloatArray:
+def check_route(robot: Mechanism, labels: Sequence[str], coordinates: FloatArray) -> FloatArray:
     """Return home (c,) [m, rad], after a check of the route from there through all stops and back.
 
     Strokes, joint limits, cones and singularities count; other constraints are those of a plan.

@@ -159,7 +159,7 @@ class Image(Kind):
     @cached_property
     def possible_setup(self) -> Mapping[str, setup.SetupItem]:
         """The poses of camera and board, the lens, and the print."""
-        numbers = dict(zip(LENS, self.nominal_lens.tolist(), strict=True))
+        numbers = dict[str, float](zip(LENS, self.nominal_lens.tolist(), strict=True))
         lens, pixel, ratio = self.lens or self.camera, Dimension.PIXEL, Dimension.RATIO
         items = {
             item: setup.SetupItem(
