@@ -19,7 +19,6 @@ from loopcal.numerics.statistics import (
     compute_component_tail,
     compute_known_median,
     compute_median,
-    compute_quantiles,
     compute_weighted_quantile,
     estimate_variance_component,
     find_distinct,
@@ -149,18 +148,10 @@ def test_the_median_of_known_values_is_that_of_numpy() -> None:
         np.testing.assert_array_equal(compute_known_median(values, axis), expected)
 
 
-@pytest.mark.parametrize("shape", [(1,), (2,), (7,), (40, 3)])
-def test_quantiles_are_those_of_numpy(shape) -> None:
-    values, shares = np.random.default_rng(1).normal(size=shape), (0.0, 0.1, 0.5, 0.9, 1.0)
-    expected = np.quantile(values, shares, axis=0)
-    np.testing.assert_allclose(compute_quantiles(values, shares), expected, rtol=1e-15)
-
-
 def test_masked_arrays_are_not_imported() -> None:
     code = (
         "import sys, numpy as np; from loopcal.numerics import statistics as own; "
         "own.find_distinct(np.array([2, 1, 2])); own.compute_median(np.array([0.1, 0.2])); "
-        "own.compute_quantiles(np.array([0.1, 0.2]), (0.1,)); "
         "print('numpy.ma' in sys.modules)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

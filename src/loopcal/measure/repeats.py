@@ -16,7 +16,7 @@ import numpy as np
 
 from loopcal.measure.observations import Observations
 from loopcal.numerics.distributions import binomial_tail
-from loopcal.numerics.statistics import compute_median, compute_quantiles
+from loopcal.numerics.statistics import compute_median
 from loopcal.typing import FloatArray, IntArray
 
 # Standard deviations of the noise by which repeats may differ. The readings of a few visits span
@@ -49,14 +49,14 @@ def find_reading_tolerance(
         for i, column in enumerate(o.kind.noise_columns):
             seen = o.present[:, i] & (o.weight > 0.0)
             if seen.any() and column.name in places:
-                span = np.ptp(compute_quantiles(o.measured[seen, places[column.name]], RANGE))
+                span = np.ptp(np.quantile(o.measured[seen, places[column.name]], RANGE))
                 sd = compute_median(np.sqrt(o.covariance[seen, i, i]))
                 share = min(share, SIGMAS * sd / span) if span > 0.0 else share
     is_known = np.isfinite(readings)
     first = np.take_along_axis(readings, is_known.argmax(axis=0)[None], axis=0)
     known = np.where(is_known, readings, np.nan_to_num(first))
     least = LEAST_RANGE * np.abs(known).max(initial=0.0)
-    tolerance = share * np.maximum(np.ptp(compute_quantiles(known, RANGE), axis=0), least)
+    tolerance = share * np.maximum(np.ptp(np.quantile(known, RANGE, axis=0), axis=0), least)
     if reading_sigma is not None:
         jitter = np.median(np.where(np.isfinite(reading_sigma), reading_sigma, 0.0), axis=0)
         tolerance = np.maximum(tolerance, 2.0 * SIGMAS * jitter)

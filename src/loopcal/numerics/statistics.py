@@ -355,16 +355,6 @@ def compute_median(values: FloatArray) -> float:
     return float(np.mean(ordered[(len(ordered) - 1) // 2 : len(ordered) // 2 + 1]))
 
 
-def compute_quantiles(values: FloatArray, shares: Sequence[float]) -> FloatArray:
-    """Return quantiles (q, ..) of values (n, ..) along the first axis, as `np.quantile`."""
-    ordered, place = np.sort(values, axis=0), np.asarray(shares) * (len(values) - 1)
-    low = np.floor(place).astype(np.int64)
-    below, above = ordered[low], ordered[np.minimum(low + 1, len(values) - 1)]
-    share = (place - low).reshape(-1, *(1,) * (values.ndim - 1))
-    step = above - below
-    return np.where(share < 0.5, below + step * share, above - step * (1.0 - share))
-
-
 def compute_known_median(values: FloatArray, axis: int) -> FloatArray:
     """Return medians along an axis of what is not NaN, as `np.nanmedian`; NaN without any."""
     ordered = np.sort(values, axis=axis)  # NaN come last

@@ -273,9 +273,6 @@ class Image(Kind):
         shape = np.broadcast_shapes(*(part.shape[:-1] for part in parts))
         return np.concatenate([np.broadcast_to(p, (*shape, p.shape[-1])) for p in parts], axis=-1)
 
-    def _predict(self, T: FloatArray, values: FloatArray, joints: FloatArray) -> Evaluation:
-        raise NotImplementedError
-
     def _measure(
         self, T: FloatArray, noise: FloatArray, values: FloatArray, joints: FloatArray
     ) -> FloatArray:
