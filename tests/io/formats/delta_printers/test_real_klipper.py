@@ -1,0 +1,228 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Klipper itself, Marlin's and RepRapFirmware's formulas judge what loopcal writes for them."""
+
+import math
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import loopcal as lc
+from loopcal.io.formats import FORMATS
+from loopcal.io.formats.import_export import build_imported_robot
+from loopcal.io.formats.program_format import ExportSource, ImportOptions
+from tests.io.formats.delta_printers.real_klipper import PINS, Printer, install
+
+MM = 1e-3
+ROUNDED = 5e-6
+"""Motion [mm] by values that are rounded to six decimals: nine of them, up to 5e-7 mm or degrees
+each, which are 2e-6 mm at the end of a radius."""
+EXACT = 1e-9
+"""Difference [mm] of two computations of the same numbers."""
+
+
+@pytest.fixture(scope="module")
+def klipper() -> None:
+    """Klipper's package, on the path."""
+    install()
+
+
+DELTA = (
+    "[include fans.cfg]\n[mcu]\nserial: x\n[printer]\nkinematics: delta\nmax_velocity: 300\n"
+    "delta_radius: 130.25 ; mm\nminimum_z_position: -5\n[delta_calibrate]\nradius: 70\n"
+    "[stepper_a]\narm_length = 250\nposition_endstop: 300\nrotation_distance: 40\n"
+    + PINS.format(0)
+    + "[stepper_b]\nangle: 329.6\nrotation_distance: 40.01\n"
+    + PINS.format(1)
+    + "[stepper_c]\nrotation_distance: 40\ngear_ratio: 80:40\n"
+    + PINS.format(2)
+)
+SAVED = """
+#*# <---------------------- SAVE_CONFIG ---------------------->
+#*# DO NOT EDIT THIS BLOCK OR BELOW. The contents are auto-generated.
+#*#
+#*# [printer]
+#*# delta_radius = 131.000000
+#*#
+#*# [stepper_c]
+#*# position_endstop = 300.4
+#*# arm_length = 250.3
+#*#
+#*# [delta_calibrate]
+"""
+STEPS = np.array([40, 40.01, 20]) / (200 * 16)
+"""Length of a step of each tower [mm]."""
+
+
+def read(path: Path, name: str = "klipper"):
+    """Return the robot and the measurements of a file."""
+    imported = FORMATS[name].read(path, ImportOptions("printer"))  # type: ignore[misc]
+    return build_imported_robot(path, imported), imported.measurements
+
+
+def disturb(robot: lc.Mechanism, seed: int) -> lc.Mechanism:
+    """Return a robot with errors of 0.3 mm and 0.2 degrees, also of what its file fixes."""
+    rng = np.random.default_rng(seed)
+    scales = [{"angle": 3e-3}.get(d.value, 3e-4) for d in robot.parameters.dimensions]
+    return robot.with_values(robot.values + rng.standard_normal(len(scales)) * scales)
+
+
+def write_delta(folder: Path, end: str = "\n") -> tuple[Path, np.ndarray]:
+    """Write a printer.cfg with heights; return it with the steps (n, 3) of its poses."""
+    rng, path = np.random.default_rng(1), folder / "printer.cfg"
+    steps = np.round(np.array([300, 300, 300]) / STEPS * rng.uniform(0.5, 0.6, (12, 3)), 3)
+    steps[:, 1:] = np.round(steps[:, :1] * STEPS[0] / STEPS[1:], 3) + rng.uniform(
+        -900, 900, (12, 2)
+    )
+    lines = [
+        f"#*# height{i} = {0.1 * i}\n#*# height{i}_pos = {','.join(f'{s:.3f}' for s in row)}\n"
+        for i, row in enumerate(steps)
+    ]
+    text = (DELTA + SAVED + "".join(lines)).rstrip("\n") + "\n"
+    path.write_bytes(text.replace("\n", end).encode())
+    (folder / "fans.cfg").write_text("[fan]\npin: PD1\n")
+    return path, np.round(steps, 3)
+
+
+def get_positions(calibration, steps: np.ndarray) -> np.ndarray:
+    """Return where Klipper sees the nozzle (n, 3) [mm] at steps below the stops (n, 3)."""
+    return np.array([calibration.get_position_from_stable(row) for row in steps.tolist()])
+
+
+def predict(robot: lc.Mechanism, readings: np.ndarray) -> np.ndarray:
+    """Return where loopcal sees the nozzle (n, 3) [mm] at readings (n, 3) [mm]."""
+    found = lc.forward(robot, readings * MM)
+    assert found.converged.all()
+    return found.T[:, :3, 3] / MM
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("end", ["\n", "\r\n"])
+def test_klipper_moves_as_loopcal_states(klipper, tmp_path, end) -> None:
+    path, steps = write_delta(tmp_path, end)
+    robot, measured = read(path)
+    assert measured is not None
+    before = Printer(path).load_kinematics("delta").get_calibration()
+    # what loopcal reads is what Klipper reads, whichever part of the file states it
+    np.testing.assert_allclose(measured.readings / MM, steps * STEPS, rtol=0, atol=EXACT)
+    np.testing.assert_allclose(
+        predict(robot, steps * STEPS), get_positions(before, steps), rtol=0, atol=EXACT
+    )
+
+    identified = disturb(robot, 2)
+    written = tmp_path / "corrected.cfg"
+    exported = FORMATS["klipper"].write(ExportSource(identified), path)  # type: ignore[misc]
+    written.write_bytes(exported.text.encode())
+    printer = Printer(written)
+    kinematics = printer.load_kinematics("delta")
+    positions = get_positions(kinematics.get_calibration(), steps)
+    np.testing.assert_allclose(predict(identified, steps * STEPS), positions, rtol=0, atol=ROUNDED)
+    again = read(written)[0]
+    np.testing.assert_allclose(predict(again, steps * STEPS), positions, rtol=0, atol=EXACT)
+    # heights of DELTA_CALIBRATE
+    from klippy.extras.delta_calibrate import DeltaCalibrate  # type: ignore[import-not-found]
+
+    probed = DeltaCalibrate(printer.config.getsection("delta_calibrate")).last_probe_positions
+    assert [height for height, _ in probed] == pytest.approx(0.1 * np.arange(12))
+    np.testing.assert_array_equal([pos for _, pos in probed], steps)
+    # the motors that step (the C code) go where loopcal's inverse kinematics says, from the stops
+    points = np.random.default_rng(3).uniform([-60, -60, 0], [60, 60, 60], (20, 3))
+    rails = kinematics.rails
+    heights = np.array([[r.calc_position_from_coord(p) for r in rails] for p in points.tolist()])
+    readings = lc.inverse(again, points * MM).q / MM
+    np.testing.assert_allclose(
+        np.array(kinematics.abs_endstops) - heights, readings, rtol=0, atol=EXACT
+    )
+    # and at the stops the nozzle is where Klipper homes
+    home = predict(again, np.zeros((1, 3)))[0]
+    np.testing.assert_allclose(home, kinematics.home_position, rtol=0, atol=EXACT)
+
+
+@pytest.mark.slow
+def test_klipper_calibrates_to_what_loopcal_identifies(klipper, tmp_path, monkeypatch) -> None:
+    """DELTA_CALIBRATE of Klipper and loopcal have the same optimum of the same heights."""
+    path = write_delta(tmp_path)[0]
+    robot = read(path)[0]
+    points = np.random.default_rng(4).uniform([-70, -70, 0], [70, 70, 0.01], (24, 3))
+    free = robot.parameters.free  # heights determine no arms
+    truth = robot.with_values(np.where(free, disturb(robot, 5).values, robot.values))
+    steps = np.round(lc.inverse(truth, points * MM).q / MM / STEPS, 3)
+    noise = np.random.default_rng(6).normal(0, 0.02, len(steps))
+    lines = [
+        f"#*# height{i} = {points[i, 2] + noise[i]:.6f}\n"
+        f"#*# height{i}_pos = {','.join(f'{s:.3f}' for s in row)}\n"
+        for i, row in enumerate(steps)
+    ]
+    path.write_text(DELTA + SAVED + "".join(lines))
+    robot, measured = read(path)
+    assert measured is not None
+    fit = lc.calibrate(robot, measured).robot
+    printer = Printer(path)
+    start = printer.load_kinematics("delta").get_calibration()
+
+    from klippy import mathutil  # type: ignore[import-not-found]
+    from klippy.extras.delta_calibrate import DeltaCalibrate  # type: ignore[import-not-found]
+
+    found = []
+
+    def descend(_printer, names, params, error):
+        found.append(mathutil.coordinate_descent(names, params, error))
+        return found[-1]
+
+    monkeypatch.setattr(mathutil, "background_coordinate_descent", descend)
+    calibrate = DeltaCalibrate(printer.config.getsection("delta_calibrate"))
+    calibrate.calculate_params(calibrate.last_probe_positions, [])
+    own = start.new_calibration(found[0])
+    difference = get_positions(own, steps) - predict(fit, steps * STEPS)
+    assert np.abs(difference[:, 2]).max() < 1e-3  # [mm], where Klipper's descent ends
+
+
+def intersect(centers: np.ndarray, lengths: np.ndarray) -> np.ndarray:
+    """Return the lower intersection of three spheres, by the plane that two differences span."""
+    A = 2 * (centers[1:] - centers[0])
+    b = (centers[1:] ** 2).sum(1) - (centers[0] ** 2).sum() - lengths[1:] ** 2 + lengths[0] ** 2
+    along = np.cross(A[0], A[1])
+    point = np.linalg.lstsq(A, b, rcond=None)[0]
+    along /= np.linalg.norm(along) * (1 if along[2] < 0 else -1)
+    off = point - centers[0]
+    p = off @ along
+    return point + along * (-p + math.sqrt(p * p - off @ off + lengths[0] ** 2))
+
+
+def parse_words(text: str) -> dict[str, dict[str, str]]:
+    """Return command -> letter -> text of its word."""
+    lines = re.findall(r"^(M\d+) (.*)$", text, re.MULTILINE)
+    return {command: dict(re.findall(r"([A-Z])([-\d.:]+)", words)) for command, words in lines}
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("marlin", "M665 L250 R130 H300 A0.1 B-0.2 C0.1 X0.1 Y-0.2 Z0\nM666 X-0.1 Y0 Z-0.2\n"),
+        ("reprap", "M665 L250:250.2:249.9 R130 H300 X0.1 Y-0.2 Z0\nM666 X-0.1 Y0.3 Z-0.2\n"),
+    ],
+)
+def test_marlin_and_reprapfirmware_move_as_loopcal_states(tmp_path, name, text) -> None:
+    """Their published formulas: carriages at their stops are H, less or plus the adjustment, above
+    the height that the rods of this tower reach over the center.
+    """
+    path = tmp_path / "config.g"
+    path.write_text(text)
+    identified = disturb(read(path, name)[0], 7)
+    words = parse_words(FORMATS[name].write(ExportSource(identified), path).text)  # type: ignore[misc]
+    number = {letter: float(value) for letter, value in words["M665"].items() if ":" not in value}
+    adjusted = np.array([float(words["M666"].get(tower, 0)) for tower in "XYZ"])
+    if name == "marlin":
+        assert (adjusted <= 0).all()  # a carriage backs off from its stop
+        rods = number["L"] + np.array([number.get(letter, 0) for letter in "ABC"])
+        stops = number["H"] - adjusted
+    else:
+        rods = np.array([float(rod) for rod in words["M665"]["L"].split(":")])
+        stops = number["H"] + adjusted
+    angles = np.radians(np.array([210, 330, 90]) + [number.get(tower, 0) for tower in "XYZ"])
+    towers = number["R"] * np.column_stack([np.cos(angles), np.sin(angles)])
+    at_stops = stops + np.sqrt(rods**2 - number["R"] ** 2)
+    drops = 200 + np.random.default_rng(8).uniform(-20, 20, (15, 3))
+    positions = [intersect(np.column_stack([towers, at_stops - drop]), rods) for drop in drops]
+    np.testing.assert_allclose(predict(identified, drops), positions, rtol=0, atol=ROUNDED)
