@@ -9,8 +9,10 @@ from __future__ import annotations
 import gc
 import json
 import shutil
+import sqlite3
 import tracemalloc
 from collections.abc import Callable, Generator, Iterable
+from contextlib import closing
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
@@ -244,6 +246,21 @@ def test_damaged_part_is_refused_before_a_folder_is_made(undisturbed, tmp_path) 
     with pytest.raises(FileError, match=f"^{tmp_path / 'part' / NAME}: this file is damaged"):
         merge_studies([undisturbed, tmp_path / "part"], tmp_path / "whole")
     assert not (tmp_path / "whole").exists()
+
+
+@pytest.mark.parametrize("damaged", ["part", "whole"])
+@pytest.mark.parametrize("change", ["seconds = 0.2", "cell = 9223372036854775807"])
+def test_damaged_block_is_refused_before_a_merge_writes(
+    undisturbed, tmp_path, damaged, change
+) -> None:
+    for name in ("part", "whole"):
+        shutil.copytree(undisturbed, tmp_path / name)
+    with closing(sqlite3.connect(tmp_path / damaged / NAME)) as connection, connection:
+        connection.execute(f"UPDATE blocks SET {change} WHERE rowid = 2")
+    before = (tmp_path / "whole" / NAME).read_bytes()
+    with pytest.raises(FileError, match=f"^{tmp_path / damaged / NAME}: block .* is damaged"):
+        merge_studies([undisturbed, tmp_path / "part"], tmp_path / "whole")
+    assert (tmp_path / "whole" / NAME).read_bytes() == before
 
 
 @dataclass

@@ -191,7 +191,7 @@ def test_damaged_part_is_named_where_its_blocks_are_copied(folder, tmp_path) -> 
         pass
     with open_store(tmp_path / "whole") as whole, open_store(folder) as part:
         with pytest.raises(FileError, match=f"^{folder / NAME}: this file is damaged"):
-            part.check_pages()
+            part.check()
         with pytest.raises(FileError, match=f"^{folder / NAME}: this file is damaged"):
             whole.copy_blocks(part, A)
 
@@ -251,7 +251,7 @@ def test_damaged_block_is_named_and_its_place_becomes_free(folder, tmp_path, cha
         store.add_block("key", B, 0, make_scores(9), 0.1)
     with closing(sqlite3.connect(folder / NAME)) as connection, connection:
         connection.execute(f"UPDATE blocks SET {change} WHERE key = 'key3'")
-    sentence = r"block .* of the cell .* is damaged"
+    sentence = r"block .* of (the|no) cell .*is damaged"
     with pytest.raises(FileError, match=sentence) as caught, read_store(folder) as store:
         _ = list(store.read_blocks(A)), list(store.read_blocks(B))
     assert caught.value.code == "store.block-damaged"

@@ -296,21 +296,27 @@ class StudyStore:
 
     def remove_damaged(self) -> tuple[str, ...]:
         """Remove all damaged blocks, which are then computed again, and return their names."""
-        damaged, columns = self.find_misshapen(), "levels, key, block, trials, seconds, scores"
+        damaged = self.find_misshapen()
         with _report_errors(self.path), self.connection:
             remove = "DELETE FROM blocks WHERE rowid = ?"
             self.connection.executemany(remove, [(row,) for row in damaged])
-            question = f"SELECT blocks.rowid, digest, {columns} {WITH_CELLS}"
-            for row, digest, name, key, block, *content in self.ask(question):
-                if _compute_digest(name, key, block, *content) != digest:
-                    damaged[row] = _name_block(name, block)
-            self.connection.executemany(remove, [(row,) for row in damaged])
-        return tuple(damaged.values())
+            changed = dict(self._find_changed())
+            self.connection.executemany(remove, [(row,) for row in changed])
+        return (*damaged.values(), *changed.values())
 
-    def check_pages(self) -> None:
+    def check(self) -> None:
         """Read the whole store, and raise FileError where it is damaged."""
         if next(self.ask("PRAGMA quick_check(1)")) != ("ok",):
             raise FileError(report_finding("store.damaged"), self.path)
+        for _, block in self._find_changed():
+            raise FileError(report_finding("store.block-damaged", block=block), self.path)
+
+    def _find_changed(self) -> Iterator[tuple[int, str]]:
+        """Yield the rows and names of the well-shaped blocks whose digest is another."""
+        columns = "levels, key, block, trials, seconds, scores"
+        for row, digest, *block in self.ask(f"SELECT blocks.rowid, digest, {columns} {WITH_CELLS}"):
+            if _compute_digest(*block) != digest:
+                yield row, _name_block(block[0], block[2])
 
     def _find_cell(self, levels: Levels) -> int:
         """Return the row of a cell, which is made where it is missing."""
@@ -327,7 +333,8 @@ def _name_cell(levels: Levels) -> str:
 
 def _name_block(levels: object, block: object) -> str:
     """Return a name of a block for messages."""
-    return f"block {block} of the cell {levels}"[:LONGEST_NAME]
+    cell = "no cell" if levels is None else f"the cell {levels}"
+    return f"block {block} of {cell}"[:LONGEST_NAME]
 
 
 def _compute_digest(
@@ -642,9 +649,9 @@ def merge_studies(
             raise FileError(
                 report_finding(code, other=str(part_folders[first]), changes=changes), part
             )
-    for part in part_folders:
+    for part in (*part_folders, *([folder] if (folder / NAME).is_file() else [])):
         with read_store(part) as other:
-            other.check_pages()
+            other.check()  # before anything is written
     file = part_folders[0] / STUDY_FILE
     source = StudySource(largest, file if file.is_file() else None)
     count = 0
