@@ -91,6 +91,10 @@ def _table_counts(counts: dict[str, Any], long: dict[str, Any]) -> dict[str, Any
         "warning of Python, or message of another form": lambda c: _count(
             c, ("warning", "message-form", "no-message", "control-character", "internal-words")
         ),
+        "refused without the name of a file, an option or a word of the input": lambda c: _count(
+            c, ("no-name",)
+        ),
+        "changed by files or variables of other programs": lambda c: _count(c, ("surroundings",)),
         "processor time per input [ms]": lambda c: round(1e3 * c["cpu_seconds"] / c["inputs"]),
     }
     rows = [[name, rule(counts), rule(long)] for name, rule in rules.items()]

@@ -121,6 +121,7 @@ def prepare_worker() -> None:
     sys.dont_write_bytecode = True  # Python compiles a module where the first run imports it
     sys.addaudithook(watch_writes)
     os.environ["COLUMNS"] = "100"
+    os.environ["PATH"] = ""  # a browser is a program of others, which the hooks cannot watch
 
 
 def _stop(_number: int, _frame: FrameType | None) -> None:
