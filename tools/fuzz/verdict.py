@@ -27,7 +27,7 @@ FRAME = re.compile(r'File "[^"]*?/src/(loopcal/[^"]+)", line (\d+), in (\S+)')
 MESSAGE = re.compile(r"^(loopcal: |Hint: |  )")
 ARCHIVES_AND_PICTURES = (b"\x89PNG", b"%PDF", b"PK", b"SQLite format 3")
 """First bytes of files that are no text."""
-SECONDS = re.compile(r"in [\d.e-]+ s\b|\"(?:worker_)?seconds\": [\d.e-]+")
+SECONDS = re.compile(r"in [\d.e-]+ s\b|\"(?:worker_)?seconds(?:_per_\w+)?\": [\d.e-]+")
 """How long a study took, which differs from run to run."""
 LOGS = (".sqlite-shm", ".sqlite-wal")
 """Files that SQLite makes beside a store, also to read it."""
@@ -215,6 +215,8 @@ def _judge_output(case: Case, name: str, content: bytes, may_name: bool) -> Iter
     if not text:
         yield Find("unreadable", f"{command} {kind}: empty", name)
     pattern = JSON_NOT_FINITE if kind == ".json" else NOT_FINITE
+    if text.startswith(("/*", "component ")):  # C, whose comments may speak of NaN
+        return
     if (kind == ".json" or not may_name) and (match := pattern.search(text)):
         near = text[max(match.start() - 80, 0) : match.end() + 40]
         yield Find("non-finite", f"{command} {kind}", f"{name}: {near}")
