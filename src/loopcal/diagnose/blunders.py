@@ -149,34 +149,45 @@ class Predictor(NamedTuple):
     def make_blocks(self, data: Measurements) -> HeldOutBlocks:
         """Return the rows of measurements with what predicts them."""
         data = fill_in_reading_sigma(self.robot, data)
+        by_y = self.predict(data)
+        member = np.unique(linked_blocks(data), return_inverse=True)[1]
+        poses = list_block_labels(data.labels, member)
+        groups = []
+        for blocks, columns, r in self.iterate_rows(data, member):
+            present = np.any(columns != 0.0, axis=2) | (r != 0.0)
+            parts = []
+            for few in np.array_split(columns, -(-len(columns) // TOGETHER)):
+                used = few.any(axis=(0, 1))  # those of their sessions
+                parts.append(few[..., used] @ by_y[used])
+            groups.append((blocks, np.concatenate(parts), r, present))
+        return HeldOutBlocks(poses, member, tuple(groups))
+
+    def iterate_rows(
+        self, data: Measurements, member: IntArray
+    ) -> Iterator[tuple[IntArray, FloatArray, FloatArray]]:
+        """Yield blocks (b,) of equal size with their derivatives (b, m, U + p + e) by nuisance
+        parameters, free parameters and errors of a model discrepancy, and residuals (b, m), in
+        standard deviations of the noise; `member` (n,) is the block of each pose.
+        """
         if self.uncertainty is None:
             nothing = np.zeros(0)
             free = FreeParameters(self.robot, nothing.astype(int), nothing, nothing, nothing > 0.0)
         else:
             free = self.uncertainty.free
-        problem = problem_of(free, data)
-        table = data.nuisance_parameters.table
+        problem, table = problem_of(free, data), data.nuisance_parameters.table
         z = free.deviation(self.robot.values[None])
         values = np.array([[self.values[name] for name in table.names]]).reshape(1, -1)
-        member = np.unique(linked_blocks(data), return_inverse=True)[1]
-        poses = list_block_labels(data.labels, member)
-        total = problem.poses.count_rows(member, len(poses))
-        by_y = self._predict(table.names, table.dimensions)
+        total = problem.poses.count_rows(member, int(member.max(initial=-1)) + 1)
         noise = 1.0 if self.uncertainty is None else self.uncertainty.noise_scale
-        groups = []
         for blocks, columns, r in iterate_blocks(problem.rows_at(z, values), member, total):
-            present = np.any(columns != 0.0, axis=2) | (r != 0.0)
-            parts = []
-            for few in np.array_split(columns, -(-len(columns) // TOGETHER)):
-                used = few.any(axis=(0, 1))  # those of their sessions
-                parts.append(few[..., used] @ by_y[used] / noise)
-            groups.append((blocks, np.concatenate(parts), r / noise, present))
-        return HeldOutBlocks(poses, member, tuple(groups))
+            yield blocks, columns / noise, r / noise
 
-    def _predict(self, names: tuple[str, ...], dimensions: tuple[Dimension, ...]) -> FloatArray:
-        """Return the derivative (U + p + m, k) of nuisance parameters, free parameters and the
-        errors of a model discrepancy by y.
+    def predict(self, data: Measurements) -> FloatArray:
+        """Return the derivative (U + p + m, k) of nuisance parameters of data, free parameters and
+        the errors of a model discrepancy by y.
         """
+        table = data.nuisance_parameters.table
+        names, dimensions = table.names, table.dimensions
         fit, U = self.uncertainty, len(names)
         p, w = (0, 0) if fit is None else (len(fit.posterior.unit), fit.root.shape[1])
         own = None if fit is None else fit.posterior.discrepancy
