@@ -30,12 +30,12 @@ from loopcal.mechanism.transmission import (
     TERMS,
     apply_weights,
     evaluate_slopes,
-    evaluate_sums,
     find_triangles,
     invert_weights,
     measure_excess,
     readings_from_joints,
     select_weights,
+    transmit_readings,
     turn_head,
 )
 from loopcal.numerics.trial_batch import map_arrays
@@ -153,7 +153,7 @@ def drive_loops(robot: Mechanism, values: FloatArray, q: FloatArray) -> tuple[Lo
         return loops, drive_joints(robot, values, q).joints
     _, tau = robot.slots(values)
     with np.errstate(invalid="ignore"):  # as in `drive_joints`
-        return loops, evaluate_sums(q, tau, robot.slots.constants)
+        return loops, transmit_readings(q, tau, robot.slots.constants)
 
 
 def follow_path(

@@ -34,6 +34,7 @@ from loopcal.mechanism.solutions import forward, inverse, jacobian
 from loopcal.mechanism.states import Status
 from loopcal.mechanism.workspace import sample_workspace
 from tests.jacobians import central_difference, check_jacobian, compile_quickly
+from tests.mechanism.derivatives import check_pose_derivatives
 from tests.robot_texts import load_text
 from tests.zoo import load_cached_robot
 
@@ -509,17 +510,17 @@ SECOND, THIRD = "q2: {reads: length, sum: {m: 1, k: 2}}", "q3: {reads: length, s
 @pytest.mark.parametrize(
     ("old", "new", "sentence", "line"),
     [
-        (SECOND, "q2: {reads: length, sum: {m: 1, kk: 2}}", "names 'kk', which no limb", 9),
+        (SECOND, "q2: {reads: length, sum: {m: 1, kk: 2}}", "names 'kk', which is neither a drive", 9),
         (SECOND, "q2: {reads: length, sum: {m: 1, h: 2}}", "'k' of limb 'K' is in no sum", 8),
         (SECOND, "q2: {reads: length, sum: {m: 2, n: 2}}\n  k: {reads: length}",
          "singular: that of actuator 'q2' follows", 9),
-        (SECOND, "q2: {reads: length, sum: {m: 0, k: 0}}", "all weights in the sum", 9),
+        (SECOND, "q2: {reads: length, sum: {m: 0, k: 0}}", "no weight other than 0", 9),
         (SECOND, "q2: {reads: length, sum: {m: 1, k: .inf}}", "is inf. Write a finite number", 9),
         (SECOND, "q2: {reads: length, sum: [m, k]}",
          "'actuators.q2.sum' is a list of 2, but a mapping is needed", 9),
         (SECOND, "q2: {reads: lenght, sum: {m: 1, k: 2}}",
          "'lenght' .did you mean 'length'... Allowed: 'length', 'angle'", 9),
-        (SECOND, "q2: {reads: length}", "'q2' drives no joint and has no `sum:`", 9),
+        (SECOND, "q2: {reads: length}", "'q2' drives no joint", 9),
         ("[weight.n]", "[weight.k]", "no term 'weight.k'", 8),
         ("[weight.n]", "[wait.n]", "no term 'wait.n'", None),
         (f"  {THIRD}\n", "", "'h' of limb 'H' is in no sum", 8),
@@ -529,8 +530,8 @@ SECOND, THIRD = "q2: {reads: length, sum: {m: 1, k: 2}}", "q3: {reads: length, s
          "5 readings .* are sums of 4 joints", 12),
         (f"  {SECOND}\n  {THIRD}\n", "  q2: {reads: length, sum: {k: 1, h: 2}}\n",
          "2 readings of 4 driven joints for 3 freedoms", None),
-        (THIRD, "q3: {reads: angle, sum: {n: 1, h: 2}}", "drives a joint that slides", None),
-        (THIRD, "q3: {triangle: {foot: [1, 0, 0], head: [0, 1, 0]}}", "together with sums", 10),
+        (THIRD, "q3: {reads: angle, sum: {n: 1, h: 2}}", "adds angles, but 'n' slides", None),
+        (THIRD, "q3: {triangle: {foot: [1, 0, 0], head: [0, 1, 0]}}", "drives no joint", 10),
     ],
 )  # fmt: skip
 def test_impossible_sums_are_refused_in_one_sentence(tmp_path, old, new, sentence, line):
@@ -548,7 +549,7 @@ def test_a_sum_of_an_angle_and_a_length_is_refused(tmp_path: Path) -> None:
     text = WRIST.replace("{joint: R, name: b", "{joint: P, name: b").replace(
         "start: 60", "start: 6"
     )
-    with pytest.raises(FileError, match="is a sum of the angle 'j3' and the length 'j2'"):
+    with pytest.raises(FileError, match="adds angles, but 'j2' slides"):
         load_text(tmp_path, text)
 
 
@@ -564,6 +565,37 @@ def test_sums_that_do_not_hold_the_platform_are_refused(tmp_path: Path) -> None:
     )
     symmetric = symmetric.replace("-700", "-800").replace("150, 100", "150, 99.999")
     assert load_text(tmp_path, symmetric).has_open_sums
+
+
+def test_a_triangle_drive_beside_sums_turns_its_joint(tmp_path: Path) -> None:
+    """As many readings as joints, and fewer: then closure determines the joints."""
+    anchors = "unknown: [offset, foot.x], length: {sd: 0.1}"
+    ram = f"j1: {{triangle: {{foot: [-300, 100, 0], head: [200, 50, 0]}}, {anchors}}}"
+    motor = "m1: {reads: angle, gain: 0.5, sum: {j1: 1}, unknown: [offset], angle: {sd: 0.1}}"
+    wrist = draw_errors(load_text(tmp_path, WRIST.replace(motor, ram)), 1)
+    value = dict(zip(wrist.parameters.names, wrist.values, strict=True))
+    angles = np.array([[0.3, 1.0, -0.2], [0.5, 0.7, 0.4]])
+    head = np.exp(1j * angles[:, 0]) * (0.2 + 0.05j)
+    ram_length = np.abs(head - value["j1.foot.x"] - 0.1j) - value["j1.offset"]
+    sums = angles[:, 2] + value["j3.weight.j2"] * angles[:, 1]
+    q = np.column_stack([ram_length, angles[:, 1], sums])
+    yaw = np.cumsum(angles, axis=1)
+    arms = np.exp(1j * yaw) * [value["arm.b.x"], 0.25, 0.08]
+    T = forward(wrist, q).T
+    assert_allclose(T[:, 0, 3] + 1j * T[:, 1, 3], arms.sum(axis=1), rtol=0, atol=1e-12)
+    check_pose_derivatives(wrist, q[None])
+    text = PLATE.replace("actuated: m}", "length: 900, chain: [{joint: R, name: pin, "
+        "at: [-1000, 800, 0], actuated: m, start: -80}]}")  # fmt: skip
+    text = text.replace("M, tip: [-1000, 800, 0]", "M, tip: [500, 0, 0]")
+    q1 = next(line for line in PLATE.splitlines() if "q1:" in line)
+    turned = f"  m: {{triangle: {{foot: [300, 100, 0], head: [20, -150, 0]}}, {anchors}}}"
+    text = text.replace(q1, turned).replace("{m: 1, k: 2}", "{n: 1, k: 2}")
+    plate = draw_errors(load_text(tmp_path, text), 2)
+    assert plate.has_open_sums
+    wanted = np.array([[0.0, 0.0, 0.0], [0.006, -0.006, 0.02]])
+    solved = forward(plate, inverse(plate, wanted).q)
+    assert_allclose(solved.T[:, :2, 3], wanted[:, :2], rtol=0, atol=1e-12)
+    check_pose_derivatives(plate, solved.q[None])
 
 
 def test_a_drive_of_two_stages_is_refused(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
 
@@ -26,7 +26,6 @@ from loopcal.mechanism.families.placement import (
     RatioTolerance,
     RecordError,
     join_errors,
-    offset_error,
     single_error,
     standard_deviation,
 )
@@ -35,6 +34,7 @@ from loopcal.mechanism.transmission import (
     LOAD,
     TABLE,
     TRIANGLE_TERMS,
+    WEIGHT,
     compute_range,
     count_independent,
     evaluate_sums,
@@ -55,7 +55,7 @@ DEAD = 1e-6
 """Sine of the angle from a dead point, below which the actuator does not turn the joint."""
 MOST_POINTS = 200
 """Rows of a table."""
-POINTS, SKEW = ("foot", "head"), "skew"
+SKEW = "skew"
 
 
 class DriveError(RecordError):
@@ -63,13 +63,6 @@ class DriveError(RecordError):
 
     def __init__(self, sentence: str, name: str) -> None:
         super().__init__(sentence, "drives", name)
-
-
-class CouplingError(RecordError):
-    """An impossible coupling; `name` is the one under which a file states it."""
-
-    def __init__(self, sentence: str, name: str) -> None:
-        super().__init__(sentence, "couplings", name)
 
 
 class StrokeError(DriveError):
@@ -325,16 +318,26 @@ class LengthCoupling(Sum):
 
 
 Coupling = AngleCoupling | LengthCoupling
+Tolerance = LengthTolerance | AngleTolerance | RatioTolerance | None
 
 
-# Drives at their joints: actuators, and their unknowns.
+# Rows of driven joints: drives and couplings at their joints, and their unknowns.
 
 CURVE_OF_BUILDUP = 1 / (4 * np.pi)
 """Term `curve` per build-up: radius + buildup * reading / (2 pi), integrated."""
 
-Tolerance = LengthTolerance | AngleTolerance | RatioTolerance | None
-Term = tuple[Dimension, float, Tolerance, str, float]
-"""Dimension, nominal value, tolerance, transmission term, and change of that term per unit."""
+
+class Term(NamedTuple):
+    """A number of a drive or coupling that can be unknown.
+
+    maps : transmission term -> its change per unit. positive : of a scale, which keeps its sign.
+    """
+
+    dimension: Dimension
+    nominal: float
+    tolerance: Tolerance
+    maps: Mapping[str, float]
+    positive: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -356,26 +359,102 @@ class DrivenJoint:
 
 
 @dataclass(frozen=True, eq=False)
-class PlacedDrive:
-    """A drive and the joint that it moves; of several joints, the first.
+class PlacedRow:
+    """A drive or coupling of a file. joints : of its sum, driven joint by the name in the file."""
 
-    turns, rotation, start : as in `DrivenJoint`. own : the actuator of the family, which gives the
-    joint from what the drive gives: offset + gain * that; it states what the drive does not.
-    weights : of the driven joints in a sum, by name.
-    """
+    SECTION: ClassVar[str]
+    WORD: ClassVar[str]
 
-    drive: Drive
-    turns: bool
-    rotation: FloatArray
-    start: float
-    own: Actuator
-    weights: Mapping[str, float] = field(default_factory=dict)
+    name: str
+    drive: Drive | Coupling
+    joints: Mapping[str, str]
 
     @property
     def dimension(self) -> Dimension:
-        """Dimension of what the transmission gives: the joint, or the length of a triangle."""
-        is_angle = self.turns and not isinstance(self.drive, TriangleDrive)
+        """Dimension of what it gives: the joint, the sum, the length of a triangle."""
+        raise NotImplementedError
+
+    @property
+    def sense(self) -> float:
+        """What the joint value changes per unit of what the drive gives."""
+        return 1.0
+
+    @property
+    def unknown(self) -> Sequence[str]:
+        """Terms to identify, in the order of the parameters."""
+        return self.drive.unknown
+
+    @property
+    def weights(self) -> dict[str, float]:
+        """Weights of the driven joints in a sum, in m and rad, by name."""
+        return {self.joints[alias]: w for part in list_parts(self.drive) for alias, w in part.items}
+
+    def list_terms(self) -> dict[str, Term]:
+        """Return the terms by the names that a file gives them; here those of a sum."""
+        return {
+            f"{part.word}.{alias}": Term(
+                part.dimension, weight, part.tolerance, {f"{WEIGHT}{self.joints[alias]}": 1.0}
+            )
+            for part in list_parts(self.drive)
+            for alias, weight in part.items
+        }
+
+
+class SumPart(NamedTuple):
+    """Weights of a sum: the word for them, that of a joint by the name in the file, whether these
+    joints turn, and the dimension and tolerance of the weights.
+    """
+
+    word: str
+    items: Iterable[tuple[str, float]]
+    turns: bool
+    dimension: Dimension
+    tolerance: Tolerance
+
+
+def list_parts(stated: Drive | Coupling) -> tuple[SumPart, ...]:
+    """Return the parts of the sum of a drive or coupling, none of a triangle drive."""
+    if isinstance(stated, TriangleDrive):
+        return ()
+    turns, ratio = isinstance(stated, AngleDrive | AngleCoupling), Dimension.RATIO
+    parts = (SumPart("weight", stated.sum.items(), turns, ratio, stated.weights),)
+    if isinstance(stated, LengthCoupling):
+        radii = stated.radius.items()
+        parts += (SumPart("radius", radii, True, Dimension.LENGTH, stated.radii),)
+    return parts
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedDrive(PlacedRow):
+    """A drive and the joint that it moves; of several joints, the first.
+
+    own : the actuator of the family, which gives the joint from what the drive gives: offset + gain
+    * that; it states what the drive does not.
+    """
+
+    SECTION: ClassVar[str] = "drives"
+    WORD: ClassVar[str] = "actuator"
+
+    drive: Drive
+    joint: DrivenJoint
+    own: Actuator
+
+    @property
+    def dimension(self) -> Dimension:
+        """Dimension of the joint, or of the length of a triangle."""
+        is_angle = self.joint.turns and not isinstance(self.drive, TriangleDrive)
         return Dimension.ANGLE if is_angle else Dimension.LENGTH
+
+    @property
+    def sense(self) -> float:
+        """Gain of the family."""
+        return self.own.terms.get("gain", 1.0)
+
+    @property
+    def unknown(self) -> Sequence[str]:
+        """Terms to identify, those of a triangle and weights first."""
+        first = ("foot", "head", SKEW, "weight")
+        return sorted(self.drive.unknown, key=lambda term: term.partition(".")[0] not in first)
 
     @property
     def stroke(self) -> tuple[float, float] | None:
@@ -383,21 +462,10 @@ class PlacedDrive:
         return self.drive.stroke or (self.own.stroke if self._is_like_own else None)
 
     @property
-    def sense(self) -> float:
-        """What the joint value changes per unit of what the drive gives."""
-        return self.own.terms.get("gain", 1.0)
-
-    @property
-    def reading(self) -> Dimension:
-        """Dimension of the reading."""
-        return Dimension(self.drive.reads)
-
-    @property
     def load(self) -> Actuator | None:
         """The load as a reading, where a compliance is stated or unknown."""
         is_elastic = self.drive.compliance or "compliance" in self.drive.unknown
-        load = Actuator(LOAD + self.own.name, self._load, reference=0.0)
-        return load if is_elastic else None
+        return Actuator(LOAD + self.name, self._load, reference=0.0) if is_elastic else None
 
     @property
     def _load(self) -> Dimension:
@@ -405,75 +473,83 @@ class PlacedDrive:
 
     @property
     def _is_like_own(self) -> bool:
-        return self.own.dimension is self.reading
+        return self.own.dimension.value == self.drive.reads
 
     @property
     def law(self) -> dict[str, float]:
         """Terms of the transmission but those of a triangle."""
         terms = {"offset": self.own.terms.get("offset", 0.0)}
-        for _, value, _, term, coefficient in self.list_terms().values():
-            if value or term == "gain":
-                terms[term] = terms.get(term, 0.0) + self.sense * coefficient * value
+        for of in self._list_own_terms().values():
+            for term, change in of.maps.items():
+                if of.nominal or term == "gain":
+                    terms[term] = terms.get(term, 0.0) + change * of.nominal
         return terms
 
     @property
     def actuator(self) -> Actuator:
         """The actuator; raises MechanismError for an impossible triangle."""
-        drive, name = self.drive, self.own.name
-        terms: Mapping[str, float] = self.law
+        drive, terms = self.drive, self.law
         if isinstance(drive, TriangleDrive):
-            terms = {**terms, **place_triangle(name, drive, self.rotation, self.start)}
-        points = tuple(reading for reading, _ in drive.table)
-        sigma = drive.sigma or (self.own.sigma if self._is_like_own else None)
+            terms |= place_triangle(self.name, drive, self.joint.rotation, self.joint.start)
         return Actuator(
-            name,
-            self.reading,
+            self.name,
+            Dimension(drive.reads),
             self.stroke,
             terms,
             drive.period,
-            sigma,
-            self.weights or ({name: 1.0} if self.load else {}),
-            points,
+            drive.sigma or (self.own.sigma if self._is_like_own else None),
+            self.weights or ({self.name: 1.0} if self.load else {}),
+            tuple(reading for reading, _ in drive.table),
             drive.interpolation,
         )
 
-    def list_terms(self) -> Mapping[str, Term]:
-        """Return the terms of the drive by the names that a file gives them."""
-        drive, ratio, length = self.drive, Dimension.RATIO, Dimension.LENGTH
-        tolerance = drive.angle if isinstance(drive, AngleDrive) else drive.length
-        own = self.dimension
-        terms: dict[str, Term] = {"offset": (own, drive.offset, tolerance, "offset", 1.0)}
-        if isinstance(drive, SpoolDrive):
-            terms["radius"] = (length, drive.radius, drive.radii, "gain", 1.0)
-            terms["buildup"] = (length, drive.buildup, drive.buildups, "curve", CURVE_OF_BUILDUP)
-        elif isinstance(drive, ScrewDrive):
-            terms["lead"] = (length, drive.lead, drive.leads, "gain", 1 / (2 * np.pi))
-        else:
-            terms["gain"] = (ratio, drive.gain, drive.ratio, "gain", 1.0)
-        reach = max(map(abs, self.stroke or (0.0,)))
-        for term in ("curve", "backlash", *HARMONICS):
-            coefficient = 1.0
-            if term == "curve":  # without a stroke it is refused where it is stated
-                coefficient = 1 / reach**2 if 0.0 < reach < np.inf else np.nan
-            terms[term] = (own, getattr(drive, term), tolerance, term, coefficient)
-        terms["compliance"] = (
-            *(own.per(self._load), drive.compliance, drive.compliances),
-            *("compliance", 1 / self.sense),  # of the joint, whatever moves it
-        )
-        for k, (_, value) in enumerate(drive.table, 1):
-            terms[f"{TABLE}{k}"] = (own, value, tolerance, f"{TABLE}{k}", 1.0)
+    def list_terms(self) -> dict[str, Term]:
+        """Return all terms by the names that a file gives them."""
+        terms = self._list_own_terms() | super().list_terms()
+        if isinstance(self.drive, TriangleDrive):
+            terms |= list_triangle_terms(self.drive, self.joint.rotation)
         return terms
+
+    def _list_own_terms(self) -> dict[str, Term]:
+        """Return the terms that the joint value is a sum of."""
+        drive, own, length, sense = self.drive, self.dimension, Dimension.LENGTH, self.sense
+        if isinstance(drive, SpoolDrive):
+            buildup = {"curve": sense * CURVE_OF_BUILDUP}
+            scale = {
+                "radius": Term(length, drive.radius, drive.radii, {"gain": sense}, positive=True),
+                "buildup": Term(length, drive.buildup, drive.buildups, buildup),
+            }
+        elif isinstance(drive, ScrewDrive):
+            pitch = {"gain": sense * (1 / (2 * np.pi))}
+            scale = {"lead": Term(length, drive.lead, drive.leads, pitch, positive=True)}
+        else:
+            gain = {"gain": sense}
+            scale = {"gain": Term(Dimension.RATIO, drive.gain, drive.ratio, gain, positive=True)}
+        reach = max(map(abs, self.stroke or (0.0,)))
+        # without a stroke a curve is refused where it is stated
+        units = {"curve": 1 / reach**2 if 0.0 < reach < np.inf else np.nan}
+        numbers = {t: getattr(drive, t) for t in ("offset", "curve", "backlash", *HARMONICS)}
+        numbers |= {f"{TABLE}{k}": value for k, (_, value) in enumerate(drive.table, 1)}
+        tolerance = drive.angle if isinstance(drive, AngleDrive) else drive.length
+        terms = {
+            name: Term(own, number, tolerance, {name: sense * units.get(name, 1.0)})
+            for name, number in numbers.items()
+        }
+        # of the joint, whatever moves it
+        given = {"compliance": sense * (1 / sense)}
+        per_load = Term(own.per(self._load), drive.compliance, drive.compliances, given)
+        return {"offset": terms["offset"]} | scale | terms | {"compliance": per_load}
 
 
 @dataclass(frozen=True, eq=False)
-class PlacedCoupling:
-    """A coupling of joints by their drives; weights in m and rad. reference : of its condition."""
+class PlacedCoupling(PlacedRow):
+    """A coupling of joints by their drives. reference : of its condition."""
 
-    name: str
+    SECTION: ClassVar[str] = "couplings"
+    WORD: ClassVar[str] = "coupling"
+
     drive: Coupling
-    weights: Mapping[str, float]
     reference: float = 0.0
-    sense: ClassVar[float] = 1.0
 
     @property
     def dimension(self) -> Dimension:
@@ -483,10 +559,76 @@ class PlacedCoupling:
     @property
     def actuator(self) -> Actuator:
         """The row of joints, whose only reading is a condition."""
-        slope = self.drive.slope
+        slope, column = self.drive.slope, self.drive.condition
         terms = {"offset": self.drive.offset - slope * self.reference, "gain": slope}
-        column = self.drive.condition
-        return Actuator(self.name, self.dimension, None, terms, weights=self.weights, column=column)
+        weights = self.weights
+        return Actuator(self.name, self.dimension, None, terms, weights=weights, column=column)
+
+    def list_terms(self) -> dict[str, Term]:
+        """Return offset, slope, weights and radii by the names that a file gives them."""
+        coupling, own = self.drive, self.dimension
+        spread = coupling.angle if isinstance(coupling, AngleCoupling) else coupling.length
+        terms = {"offset": Term(own, coupling.offset, spread, {"offset": 1.0})}
+        if coupling.condition:
+            per = own.per(get_condition_dimension(coupling.condition))
+            turns = {"gain": 1.0, "offset": -self.reference}  # about the reference
+            terms["slope"] = Term(per, coupling.slope, coupling.slopes, turns)
+        return terms | super().list_terms()
+
+
+def row_errors(
+    row: PlacedRow, unknown: Iterable[str] | None = None, spread: ErrorTolerances | None = None
+) -> ErrorModel:
+    """Return the unknown terms of a drive or coupling, `q1.offset`, `gear.weight.arm.pin` ..; what
+    stands before a point, and `table`, means all of a kind. Raises RecordError for impossible ones.
+
+    unknown : default: those of the file. spread : tolerances, in place of those of the file.
+    """
+    name, terms, errors = row.name, row.list_terms(), []
+    for stated in row.unknown if unknown is None else unknown:
+        kinds = {term: term.partition(".")[0].rstrip("0123456789") for term in terms}
+        whole = [term for term, of in terms.items() if stated == kinds[term] and of.maps]
+        chosen = [stated] if stated in terms else whole
+        if not chosen:
+            hint = f"{suggest_names(stated, list(terms))}. Allowed: {', '.join(terms)}"
+            sentence = f"{row.WORD} {name!r} has no term {stated!r}{hint}"
+            raise RecordError(sentence, row.SECTION, name)
+        for term in chosen:
+            dimension, nominal, tolerance, changes, positive = terms[term]
+            parameter = f"{name}.{term}"
+            if not changes:
+                raise RecordError(
+                    f"{parameter} rotates the triangle about the joint's own axis, which changes "
+                    "no length. Leave it out",
+                    row.SECTION,
+                    name,
+                )
+            sd = spread.select(dimension) if spread else standard_deviation(tolerance, parameter)
+            maps = [
+                LinearMap(parameter, Address(name, "transmission", axis), change)
+                for axis, change in changes.items()
+            ]
+            errors.append(single_error(parameter, dimension, nominal, sd, *maps, positive=positive))
+    return join_errors(errors)
+
+
+def complete_row(row: PlacedRow, spread: ErrorTolerances) -> ErrorModel:
+    """Return the offset of a drive or coupling, and those dimensions of a triangle that, with the
+    offset, have the effects of all others, as parameters.
+
+    These are two coordinates of the foot across the axis of the joint, and the one of the head that
+    changes its lever most: see docs/theory/kinematics.md.
+    """
+    unknown = ["offset"]
+    if isinstance(row, PlacedDrive) and isinstance(row.drive, TriangleDrive):
+        across = row.joint.rotation[:, :2]
+        foot = sorted(np.argsort(-np.linalg.norm(across, axis=1), kind="stable")[:2].tolist())
+        head = int(np.argmax(np.abs(across @ (across.T @ row.drive.triangle.head))))
+        unknown += [*(f"foot.{AXES[3 + i]}" for i in foot), f"head.{AXES[3 + head]}"]
+    return row_errors(row, unknown, spread)
+
+
+# Conditions, and the joints of drives and couplings.
 
 
 def get_condition_dimension(name: str) -> Dimension:
@@ -508,222 +650,213 @@ def list_conditions(stated: Mapping[str, Condition]) -> Iterator[Actuator]:
         yield Actuator(name, dimension, condition.range, reference=condition.reference)
 
 
-def couple_joints(
-    limbs: Iterable[PlacedLimb],
-    drives: Mapping[str, Drive],
-    stated: Mapping[str, Coupling],
-    conditions: Mapping[str, Condition],
-) -> tuple[tuple[PlacedLimb, ...], tuple[PlacedCoupling, ...]]:
-    """Return the couplings of a file, and its limbs with `limb.joint` as the drive of each passive
-    joint that a coupling, or the sum of a drive, names.
-
-    A coupling of limbs that are copied is one for each copy. Raises MechanismError: unknown joints,
-    and couplings of unlike ones.
+class PlacedRows(NamedTuple):
+    """Drives in the order of the readings and couplings, by name, and the limbs with `limb.joint`
+    as the drive of each passive joint that they name.
     """
-    limbs = tuple(limbs)
-    known, turning = dict[str, list[str]](), dict[str, bool]()
-    for limb in limbs:
-        copy = limb.name.removeprefix(limb.stem)
-        for joint in limb.limb.joints:
-            name = joint.actuator or f"{limb.name}.{joint.name}"
-            turning[name] = joint.kind == "R"
-            for alias in (f"{limb.name}.{joint.name}", f"{limb.stem}.{joint.name}"):
-                known.setdefault(alias, []).append(name)
-            for alias in {name, name.removesuffix(copy)} if joint.actuator else ():
-                known.setdefault(alias, []).append(name)
-        if limb.limb.actuator:
-            name, turning[limb.limb.actuator] = limb.limb.actuator, False
-            for alias in {name, name.removesuffix(copy)}:
-                known.setdefault(alias, []).append(name)
-    known = {alias: list(dict.fromkeys(names)) for alias, names in known.items()}
-    couplings: list[PlacedCoupling] = []
-    for key, coupling in stated.items():
-        name = coupling.condition
-        if name in FORCES:
-            raise CouplingError(
-                f"coupling {key!r} names {name!r}, but a load acts through drives; state the "
-                "`compliance:` of a drive",
-                key,
-            )
-        if name and name not in conditions:
-            raise CouplingError(
-                f"coupling {key!r} names the condition {name!r}, which the file does not state"
-                f"{suggest_names(name, list(conditions))}. Add it to `conditions:`",
-                key,
-            )
-        reference = conditions[name].reference if name else 0.0
-        couplings += _place_coupling(key, coupling, known, turning, reference)
-    for name in conditions:
-        if all(coupling.condition != name for coupling in stated.values()):
+
+    limbs: tuple[PlacedLimb, ...]
+    drives: dict[str, PlacedDrive]
+    couplings: dict[str, PlacedCoupling]
+
+
+def place_rows(
+    limbs: Sequence[PlacedLimb],
+    stated: Mapping[str, Drive],
+    own: Iterable[Actuator] = (),
+    couplings: Mapping[str, Coupling] | None = None,
+    conditions: Mapping[str, Condition] | None = None,
+) -> PlacedRows:
+    """Return drives and couplings at their joints; those of limbs that are copied are one for each
+    copy. Raises RecordError where joints and rows do not fit.
+
+    A drive that several limbs name is one drive. stated : the drives of the file; one that is not
+    listed reads the joint itself. own : what the family knows of its drives.
+    """
+    joints, known = find_driven_joints(limbs)
+    coupled = {
+        name: PlacedCoupling(name, coupling, names, reference)
+        for key, coupling in (couplings or {}).items()
+        for reference in [_find_reference(key, coupling, conditions or {})]
+        for name, names in _name_joints(key, coupling, PlacedCoupling, joints, known)
+    }
+    for condition in conditions or {}:
+        if all(row.drive.condition != condition for row in coupled.values()):
             raise RecordError(
-                f"the condition {name!r} is in no coupling. Name it there, or leave it out",
+                f"the condition {condition!r} is in no coupling. Name it there, or leave it out",
                 "conditions",
-                name,
+                condition,
             )
-    used = {joint for coupling in couplings for joint in coupling.weights}
-    used |= {joint for drive in drives.values() for joint in getattr(drive, "sum", ())}
+    sums = [key for key, drive in stated.items() if getattr(drive, "sum", None)]
+    keys: dict[str, tuple[str | None, Mapping[str, str]]] = {
+        name: (key, names)
+        for key in sums
+        for name, names in _name_joints(key, stated[key], PlacedDrive, joints, known)
+    }
+    for name, joint in joints.items():
+        key = next((key for key in (name, joint.stated) if key in stated), None)
+        if not joint.is_passive and key not in sums and (key or not sums):
+            keys[name] = key, {}
+    if sums:  # the file states the order of the readings
+        order = {key: i for i, key in enumerate(stated)}
+        keys = dict(sorted(keys.items(), key=lambda item: order[item[1][0] or ""]))
+    base, drives = {actuator.name: actuator for actuator in own}, dict[str, PlacedDrive]()
+    for name, (key, names) in keys.items():
+        joint = joints[next(iter(names.values()), name)]
+        plain = AngleDrive(reads="angle") if joint.turns else LengthDrive(reads="length")
+        drive = plain if key is None else stated[key]
+        from_family = base.get(name) or Actuator(name, Dimension(drive.reads))
+        drives[name] = PlacedDrive(name, drive, names, joint, from_family)
+        _check_drive(drives[name])
+    groups = {joint.stated for joint in joints.values() if not joint.is_passive}
+    refuse_idle_drives(stated, drives, groups.union(sums))
+    used = {joint for row in (*coupled.values(), *drives.values()) for joint in row.weights}
+    if used:
+        known_rows = {name: drives[name].weights or {name: 1.0} for name in drives}
+        known_rows |= {name: row.weights for name, row in coupled.items()}
+        driven = {name: of.limb for name, of in joints.items() if name in used or not of.is_passive}
+        _check_rows(known_rows, driven)
+    if strokes := {name: words for name in drives if (words := _word_stroke(drives[name]))}:
+        raise StrokeError(strokes)
 
     def name_passive(limb: Limb, joint: Joint) -> Joint:
-        own = f"{limb.name}.{joint.name}"
-        is_coupled = not joint.actuator and own in used
-        return replace(joint, actuator=own, is_passive=True) if is_coupled else joint
+        name = f"{limb.name}.{joint.name}"
+        is_coupled = not joint.actuator and name in used
+        return replace(joint, actuator=name, is_passive=True) if is_coupled else joint
 
-    placed = [
+    placed = (
         limb._replace(limb=replace(own, joints=tuple(name_passive(own, j) for j in own.joints)))
         for limb in limbs
         for own in [limb.limb]
-    ]
-    return tuple(placed), tuple(couplings)
+    )
+    return PlacedRows(tuple(placed), drives, coupled)
 
 
-def _place_coupling(
-    key: str,
-    coupling: Coupling,
-    known: Mapping[str, Sequence[str]],
-    turning: Mapping[str, bool],
-    reference: float,
-) -> Iterator[PlacedCoupling]:
-    """Yield a coupling, or those of all copies. known : alias -> names of driven joints."""
-    radius: Mapping[str, float] = getattr(coupling, "radius", {})
-    weights = {**coupling.sum, **radius}
-    for alias in coupling.sum:
-        if alias in radius:
-            raise CouplingError(
-                f"coupling {key!r} has {alias!r} under both `sum:` and `radius:`. List it once", key
-            )
-    for alias, weight in weights.items():
-        if alias not in known:
-            raise CouplingError(
-                f"coupling {key!r} names {alias!r}, which is neither a drive nor a joint of a limb"
-                f"{suggest_names(alias, list(known))}. Write limb.joint or the name of a drive",
-                key,
-            )
-        is_angle = coupling.of == "angle" or alias not in coupling.sum
-        if turning[known[alias][0]] != is_angle:
-            raise CouplingError(
-                f"coupling {key!r} adds {'angles' if is_angle else 'lengths'}, but {alias!r} "
-                + ("slides. Give `of: length`" if is_angle else "turns. List it under `radius:`"),
-                key,
-            )
-        if not np.isfinite(weight):
-            raise CouplingError(
-                f"the weight of {alias!r} in coupling {key!r} is {weight:g}. Give a finite number",
-                key,
-            )
-    if not any(weights.values()):
-        raise CouplingError(
-            f"coupling {key!r} has no weight other than 0, so it couples nothing. Give one", key
-        )
-    counts = {len(known[alias]) for alias in weights} - {1}
-    if len(counts) > 1:
-        raise CouplingError(
-            f"coupling {key!r} names joints of limbs with {' and '.join(map(str, sorted(counts)))} "
-            "copies. Name single copies",
+def find_driven_joints(
+    limbs: Iterable[PlacedLimb],
+) -> tuple[dict[str, DrivenJoint], dict[str, list[str]]]:
+    """Return all joints and rods under the names of their drives, passive ones as `limb.joint`, and
+    the names that each name in a file means.
+    """
+    joints, known = dict[str, DrivenJoint](), dict[str, dict[str, None]]()
+    for limb in limbs:
+        own, copy = limb.limb, limb.name.removeprefix(limb.stem)
+        found = [
+            (j.actuator, j.name, j.kind == "R", limb.rotations[j.name], j.start) for j in own.joints
+        ]
+        for drive, joint, turns, rotation, start in (
+            *found,
+            (own.actuator, "", False, np.eye(3), 0.0),
+        ):
+            name, names = drive or f"{limb.name}.{joint}", list[str]()
+            if joint:
+                names += f"{limb.name}.{joint}", f"{limb.stem}.{joint}"
+            if drive:
+                names += drive, drive.removesuffix(copy)
+            if names:
+                place = limb.name, turns, rotation, start, not drive
+                joints.setdefault(name, DrivenJoint(name, name.removesuffix(copy), *place))
+            for alias in names:
+                known.setdefault(alias, {})[name] = None
+    return joints, {alias: list(names) for alias, names in known.items()}
+
+
+def _find_reference(key: str, coupling: Coupling, conditions: Mapping[str, Condition]) -> float:
+    """Return the reference of the condition of a coupling, 0 for none."""
+    name = coupling.condition
+    if name in FORCES:
+        raise RecordError(
+            f"coupling {key!r} names {name!r}, but a load acts through drives; state the "
+            "`compliance:` of a drive",
+            "couplings",
             key,
         )
+    if name and name not in conditions:
+        raise RecordError(
+            f"coupling {key!r} names the condition {name!r}, which the file does not state"
+            f"{suggest_names(name, list(conditions))}. Add it to `conditions:`",
+            "couplings",
+            key,
+        )
+    return conditions[name].reference if name else 0.0
+
+
+def _name_joints(
+    key: str,
+    stated: Drive | Coupling,
+    row: type[PlacedRow],
+    joints: Mapping[str, DrivenJoint],
+    known: Mapping[str, Sequence[str]],
+) -> Iterator[tuple[str, Mapping[str, str]]]:
+    """Yield name and driven joints of a sum, or those of all copies. known : name in the file ->
+    names of driven joints.
+    """
+
+    def refuse(sentence: str) -> RecordError:
+        return RecordError(f"{row.WORD} {key!r} {sentence}", row.SECTION, key)
+
+    weights: dict[str, float] = {}
+    names = [alias for part in list_parts(stated) for alias, _ in part.items]
+    for part in list_parts(stated):
+        for alias, weight in part.items:
+            if names.count(alias) > 1:
+                raise refuse(f"has {alias!r} under both `sum:` and `radius:`. List it once")
+            if alias not in known:
+                raise refuse(
+                    f"names {alias!r}, which is neither a drive nor a joint of a limb"
+                    f"{suggest_names(alias, list(known))}. Write limb.joint or the name of a drive"
+                )
+            if joints[known[alias][0]].turns != part.turns:
+                has_radii = isinstance(stated, LengthCoupling)
+                remedy = "List it under `radius:`" if has_radii else "Sum joints of one kind"
+                raise refuse(
+                    f"adds angles, but {alias!r} slides. Give `of: length` or `reads: length`"
+                    if part.turns
+                    else f"adds lengths, but {alias!r} turns. {remedy}"
+                )
+            if not np.isfinite(weight):
+                raise refuse(f"gives {alias!r} the weight {weight:g}. Give a finite number")
+            weights[alias] = weight
+    if not any(weights.values()):
+        raise refuse("has no weight other than 0, so it states nothing. Give one")
+    counts = {len(known[alias]) for alias in weights} - {1}
+    if len(counts) > 1:
+        numbers = " and ".join(map(str, sorted(counts)))
+        raise refuse(f"names joints of limbs with {numbers} copies. Name single copies")
     count = counts.pop() if counts else 0
     for i in range(max(count, 1)):
-        name = f"{key}{i + 1}" if count else key
-        own = {known[a][i if len(known[a]) > 1 else 0]: w for a, w in weights.items()}
-        yield PlacedCoupling(name, coupling, own, reference)
+        own = {a: known[a][i if len(known[a]) > 1 else 0] for a in weights}
+        yield f"{key}{i + 1}" if count else key, own
 
 
-def coupling_errors(placed: PlacedCoupling) -> ErrorModel:
-    """Return the unknown offset, weights and radii of a coupling, as `gear.weight.arm.pin`."""
-    name, coupling = placed.name, placed.drive
-    of_radii = getattr(coupling, "radius", {})
-    own = dict(zip({**coupling.sum, **of_radii}, placed.weights, strict=True))
-    spread = coupling.angle if isinstance(coupling, AngleCoupling) else coupling.length
-    terms: dict[str, tuple[Dimension, float, Tolerance, str]]
-    terms = {"offset": (placed.dimension, coupling.offset, spread, "offset")}
-    if coupling.condition:
-        per = placed.dimension.per(get_condition_dimension(coupling.condition))
-        terms["slope"] = per, coupling.slope, coupling.slopes, "gain"
-    for key, joints, dimension, tolerance in (
-        (WEIGHT, coupling.sum, Dimension.RATIO, coupling.weights),
-        ("radius", of_radii, Dimension.LENGTH, getattr(coupling, "radii", None)),
-    ):
-        for alias, weight in joints.items():
-            terms[f"{key}.{alias}"] = dimension, weight, tolerance, f"{WEIGHT}.{own[alias]}"
-    errors = []
-    for stated in coupling.unknown:
-        chosen = [term for term in terms if stated in (term, term.partition(".")[0])]
-        if not chosen:
-            hint = f"{suggest_names(stated, list(terms))}. Allowed: {', '.join(terms)}"
-            raise CouplingError(f"coupling {name!r} has no term {stated!r}{hint}", name)
-        for term in chosen:
-            dimension, nominal, tolerance, axis = terms[term]
-            parameter = f"{name}.{term}"
-            sd = standard_deviation(tolerance, parameter)
-            maps = [LinearMap(parameter, Address(name, "transmission", axis))]
-            if axis == "gain":  # the slope turns about the reference
-                offset = Address(name, "transmission", "offset")
-                maps.append(LinearMap(parameter, offset, -placed.reference))
-            errors.append(single_error(parameter, dimension, nominal, sd, *maps))
-    return join_errors(errors)
-
-
-def list_driven_joints(limb: PlacedLimb) -> Iterator[DrivenJoint]:
-    """Yield the driven joints of a limb, the rod last."""
-    placed, suffix = limb.limb, limb.name.removeprefix(limb.stem)
-    for j in placed.joints:
-        if j.actuator:
-            stated, turn = j.actuator.removesuffix(suffix), limb.rotations[j.name]
-            turns = j.kind == "R"
-            yield DrivenJoint(j.actuator, stated, placed.name, turns, turn, j.start, j.is_passive)
-    if placed.actuator:
-        stated = placed.actuator.removesuffix(suffix)
-        yield DrivenJoint(placed.actuator, stated, placed.name, False, np.eye(3), 0.0)
-
-
-def place_drives(
-    limbs: Iterable[PlacedLimb],
-    stated: Mapping[str, Drive],
-    own: Iterable[Actuator] = (),
-    couplings: Iterable[PlacedCoupling] = (),
-) -> dict[str, PlacedDrive]:
-    """Return the drives by name, in the order of the readings, with their joints.
-
-    A drive that several limbs name is one drive. stated : the drives of the file; one that is not
-    listed reads the joint itself. own : what the family knows of its drives. couplings : of
-    `couple_joints`.
-    Raises MechanismError: a drive without a joint, or of another kind than its joint.
+def _check_rows(sums: Mapping[str, Mapping[str, float]], known: Mapping[str, str]) -> None:
+    """Refuse sums, readings and couplings by name with the weights of their joints, that leave a
+    driven joint out or repeat each other. known : driven joint -> its limb.
     """
-    joints: dict[str, DrivenJoint] = {}
-    for joint in (joint for limb in limbs for joint in list_driven_joints(limb)):
-        joints.setdefault(joint.name, joint)
-    known, drives = {actuator.name: actuator for actuator in own}, dict[str, PlacedDrive]()
-    rows = {coupling.name: coupling.weights for coupling in couplings}
-    limb_of = {name: joint.limb for name, joint in joints.items()}
-
-    def place(name: str, drive: Drive | None, joint: DrivenJoint) -> PlacedDrive:
-        plain = AngleDrive(reads="angle") if joint.turns else LengthDrive(reads="length")
-        drive = drive or plain
-        check_motion(name, drive, joint.turns)
-        base = known.get(name) or Actuator(name, Dimension(drive.reads))
-        return _check_terms(PlacedDrive(drive, joint.turns, joint.rotation, joint.start, base))
-
-    if has_sums(stated):
-        named = {name: joint.stated for name, joint in joints.items()}
-        turning = {name: joint.turns for name, joint in joints.items()}
-        readings = list_readings(stated, named)
-        for name, (_, weights) in readings.items():
-            _check_sum(name, weights, turning)
-        check_rows({**{name: w for name, (_, w) in readings.items()}, **rows}, limb_of)
-        for name, (key, weights) in readings.items():
-            own_joint = tuple(weights) == (name,) and weights[name] == 1.0
-            placed = place(name, stated[key], joints[next(iter(weights))])
-            drives[name] = replace(placed, weights={} if own_joint else weights)
-    else:
-        for name, joint in joints.items():
-            if not joint.is_passive:
-                drives[name] = place(name, stated.get(name) or stated.get(joint.stated), joint)
-        if rows:
-            check_rows({name: {name: 1.0} for name in drives} | rows, limb_of)
-    if strokes := {name: words for name in drives if (words := _word_stroke(drives[name]))}:
-        raise StrokeError(strokes)
-    refuse_idle_drives(stated, drives, {joint.stated for joint in joints.values()})
-    return drives
+    read = {joint for weights in sums.values() for joint, w in weights.items() if w != 0.0}
+    unread = [joint for joint in known if joint not in read]
+    if unread:
+        raise DriveError(
+            f"joint {unread[0]!r} of limb {known[unread[0]]!r} is in no sum, so no reading states "
+            f"it. Add it to a `sum:`, or list {unread[0]!r} among the actuators",
+            next(iter(sums)),
+        )
+    W = np.array([[weights.get(joint, 0.0) for joint in known] for weights in sums.values()])
+    a, joints = W.shape
+    if a > joints:
+        raise DriveError(
+            f"{a} readings ({', '.join(sums)}) are sums of {joints} joints "
+            f"({', '.join(known)}). Leave out readings",
+            list(sums)[-1],
+        )
+    for i in range(a):
+        if count_independent(W[: i + 1]) <= i:
+            name = list(sums)[i]
+            raise DriveError(
+                f"the weights of the sums are singular: that of actuator {name!r} follows from "
+                f"those of {', '.join(list(sums)[:i])}, so it states nothing new. Correct a weight",
+                name,
+            )
 
 
 def _word_stroke(placed: PlacedDrive) -> str:
@@ -737,7 +870,7 @@ def _word_stroke(placed: PlacedDrive) -> str:
     if not outside:
         return ""
     return (
-        f"the stroke of actuator {placed.own.name!r} contains the length {' and '.join(outside)}, "
+        f"the stroke of actuator {placed.name!r} contains the length {' and '.join(outside)}, "
         f"which no angle of its joint reaches: the anchors are {low * 1e3:.6g} to "
         f"{high * 1e3:.6g} mm apart"
     )
@@ -758,16 +891,25 @@ def refuse_idle_drives(
             )
 
 
-def _check_terms(placed: PlacedDrive) -> PlacedDrive:
-    """Return a drive; refuse a term that is stated or unknown and cannot be."""
-    drive, name = placed.drive, placed.own.name
+def _check_drive(placed: PlacedDrive) -> None:
+    """Refuse a drive whose transmission does not give what its joint does, and a term that is
+    stated or unknown and cannot be (DriveError).
+    """
+    drive, name, turns = placed.drive, placed.name, placed.joint.turns
+    if turns != isinstance(drive, AngleDrive | TriangleDrive):
+        motion, allowed = (
+            ("turns", "reads: angle without a radius, or a triangle")
+            if turns
+            else ("slides", "reads: length, or reads: angle with a radius")
+        )
+        raise DriveError(f"actuator {name!r} drives a joint that {motion}. Give {allowed}", name)
     stated = {term for term in ("curve", *HARMONICS) if getattr(drive, term)} | {*drive.unknown}
     for term in HARMONICS:
         if term in stated and not drive.period:
             raise DriveError(
                 f"actuator {name!r} states {term}, but no period. Give the reading's period", name
             )
-    if "curve" in stated and not np.isfinite(placed.list_terms()["curve"][-1]):
+    if "curve" in stated and not np.isfinite(placed.list_terms()["curve"].maps["curve"]):
         raise DriveError(
             f"actuator {name!r} states a curve, the deviation at the far end of its stroke, but no "
             "stroke. Give the stroke",
@@ -783,12 +925,11 @@ def _check_terms(placed: PlacedDrive) -> PlacedDrive:
         )
     if drive.table:
         _check_table(placed)
-    return placed
 
 
 def _check_table(placed: PlacedDrive) -> None:
     """Refuse a table of one point, out of order, or with which a reading has two joint values."""
-    name, points = placed.own.name, np.array([reading for reading, _ in placed.drive.table])
+    name, points = placed.name, np.array([reading for reading, _ in placed.drive.table])
     if not 2 <= len(points) <= MOST_POINTS or not (np.diff(points) > 0.0).all():
         raise DriveError(
             f"the table of actuator {name!r} has {len(points)} points. Give 2 to {MOST_POINTS} "
@@ -806,71 +947,6 @@ def _check_table(placed: PlacedDrive) -> None:
             "joint value. Correct a value, or give the gain",
             name,
         )
-
-
-def drive_errors(placed: PlacedDrive) -> ErrorModel:
-    """Return the unknown terms of a drive, `q1.offset` ..; MechanismError for impossible ones."""
-    drive, name, known = placed.drive, placed.own.name, placed.list_terms()
-    errors = [weight_errors(name, drive, placed.weights, tuple(known))]
-    if isinstance(drive, TriangleDrive):
-        errors.insert(0, triangle_errors(name, drive, placed.rotation, tuple(known)))
-    whole = {TABLE: [f"{TABLE}{k + 1}" for k in range(len(drive.table))]} if drive.table else {}
-    for term in (part for stated in drive.unknown for part in whole.get(stated, [stated])):
-        if is_of_triangle(drive, term) or is_weight(placed.weights, term):
-            continue
-        if term not in known:
-            raise _refuse_term(name, term, tuple(known))
-        errors.append(_term_error(placed, term))
-    return join_errors(errors)
-
-
-def _refuse_term(name: str, term: str, allowed: tuple[str, ...]) -> DriveError:
-    """Return the error of a drive that has no such term."""
-    hint = f"{suggest_names(term, allowed)}. Allowed: {', '.join(allowed)}"
-    return DriveError(f"actuator {name!r} has no term {term!r}{hint}", name)
-
-
-def _term_error(placed: PlacedDrive, term: str) -> ErrorModel:
-    """Return a term of a drive as a parameter."""
-    name = placed.own.name
-    dimension, nominal, tolerance, axis, coefficient = placed.list_terms()[term]
-    parameter, address = f"{name}.{term}", Address(name, "transmission", axis)
-    sd = standard_deviation(tolerance, parameter)
-    entry = LinearMap(parameter, address, placed.sense * coefficient)
-    is_scale = axis == "gain"
-    return single_error(parameter, dimension, nominal, sd, entry, positive=is_scale)
-
-
-def check_motion(name: str, drive: Drive, turns: bool) -> None:
-    """Refuse a drive whose transmission does not give what its joint does (MechanismError)."""
-    if turns == isinstance(drive, AngleDrive | TriangleDrive):
-        return
-    motion, allowed = (
-        ("turns", "reads: angle without a radius, or a triangle")
-        if turns
-        else ("slides", "reads: length, or reads: angle with a radius")
-    )
-    raise DriveError(f"actuator {name!r} drives a joint that {motion}. Give {allowed}", name)
-
-
-def complete_drives(
-    drives: Mapping[str, PlacedDrive], couplings: Iterable[PlacedCoupling], spread: ErrorTolerances
-) -> ErrorModel:
-    """Return the offsets of drives and couplings and dimensions of triangles as parameters."""
-    errors = [
-        offset_error(f"{c.name}.offset", c.name, d, c.drive.offset, spread.select(d))
-        for c in couplings
-        for d in [c.dimension]
-    ]
-    for name, placed in drives.items():
-        tolerance = spread.select(placed.dimension)
-        errors.append(
-            offset_error(f"{name}.offset", name, placed.dimension, placed.drive.offset, tolerance)
-        )
-        if isinstance(placed.drive, TriangleDrive):
-            lengths = LengthTolerance(sd=spread.length) if spread.length else None
-            errors.append(complete_triangle(name, placed.drive, placed.rotation, lengths))
-    return join_errors(errors)
 
 
 # Triangles: a linear actuator between two anchors beside a rotary joint.
@@ -910,213 +986,23 @@ def place_triangle(
     return dict(zip(TRIANGLE_TERMS, (float(term) for term in terms), strict=True))
 
 
-def triangle_errors(
-    name: str, drive: TriangleDrive, rotation: FloatArray, other: tuple[str, ...]
-) -> ErrorModel:
-    """Return the unknown dimensions of a triangle, `q1.foot.x` and so on; `other` are the other
-    terms of the drive. Raises MechanismError: a dimension that a triangle does not have, or a skew
-    about its axis.
+def list_triangle_terms(drive: TriangleDrive, rotation: FloatArray) -> Iterator[tuple[str, Term]]:
+    """Yield the dimensions of a triangle by name, `foot.x` and so on; a skew about the axis of the
+    joint changes nothing.
     """
-    known = (
-        *(f"{point}.{axis}" for point in POINTS for axis in AXES[3:]),
-        *(f"{SKEW}.{axis}" for axis in AXES[:3]),
-    )
-    errors = []
-    for term in _expand_unknowns(drive, rotation):
-        if term not in known:
-            raise _refuse_term(name, term, (*other, *POINTS, SKEW, *known))
-        part, _, axis = term.partition(".")
-        direction = np.eye(3)[AXES.index(axis) % 3]
-        components = rotation.T @ direction
-        is_skew, parameter = part == SKEW, f"{name}.{term}"
-        if is_skew and np.linalg.norm(components[:2]) < ON_AXIS:
-            raise DriveError(
-                f"{parameter} rotates the triangle about the joint's own axis, which changes no "
-                "length. Leave it out",
-                name,
-            )
-        stated = getattr(drive.triangle, part)
-        nominal = getattr(stated, axis) if is_skew else stated[AXES.index(axis) % 3]
-        tolerance = drive.angle if is_skew else drive.length
-        maps = tuple(
-            LinearMap(parameter, Address(name, "transmission", f"{part}.{own}"), float(share))
-            for own, share in zip("xy" if is_skew else "xyz", components, strict=False)
-            if abs(share) > 1e-12
-        )
-        dimension = Dimension.ANGLE if is_skew else Dimension.LENGTH
-        sd = standard_deviation(tolerance, parameter)
-        errors.append(single_error(parameter, dimension, nominal, sd, *maps))
-    return join_errors(errors)
-
-
-def complete_triangle(
-    name: str, drive: TriangleDrive, rotation: FloatArray, tolerance: LengthTolerance | None
-) -> ErrorModel:
-    """Return the dimensions of a triangle that, with its offset, have the effects of all others.
-
-    These are two coordinates of the foot across the axis of the joint, and the one of the head that
-    changes its lever most: see docs/theory/kinematics.md. Arguments are as above.
-    """
-    across = rotation[:, :2]
-    foot = sorted(np.argsort(-np.linalg.norm(across, axis=1), kind="stable")[:2].tolist())
-    head = int(np.argmax(np.abs(across @ (across.T @ drive.triangle.head))))
-    unknown = (*(f"foot.{AXES[3 + i]}" for i in foot), f"head.{AXES[3 + head]}")
-    return triangle_errors(name, replace(drive, unknown=unknown, length=tolerance), rotation, ())
-
-
-def is_of_triangle(drive: object, term: str) -> bool:
-    """Return whether an unknown of a drive is a dimension of its triangle."""
-    return isinstance(drive, TriangleDrive) and term.partition(".")[0] in (*POINTS, SKEW)
-
-
-def _expand_unknowns(drive: TriangleDrive, rotation: FloatArray) -> Iterator[str]:
-    """Yield the unknown dimensions, `foot` as foot.x, foot.y, foot.z.
-
-    A whole skew is that about the two axes across that of the joint, if it is along one.
-    """
-    for term in drive.unknown:
-        if term in POINTS:
-            yield from (f"{term}.{axis}" for axis in AXES[3:])
-        elif term == SKEW:
-            across = np.linalg.norm(rotation[:, :2], axis=1) > ON_AXIS
-            yield from (
-                f"{SKEW}.{a}" for a, is_across in zip(AXES[:3], across, strict=True) if is_across
-            )
-        elif is_of_triangle(drive, term):
-            yield term
-
-
-# Drives of `limbs` files whose readings are sums of joint values: `sum: {m: 1, n: 2}`.
-
-WEIGHT = "weight"
-
-
-def has_sums(actuators: Mapping[str, object]) -> bool:
-    """Return whether a drive of a file is a sum."""
-    return any(getattr(drive, "sum", None) for drive in actuators.values())
-
-
-def list_readings(
-    actuators: Mapping[str, object], joints: Mapping[str, str]
-) -> dict[str, tuple[str, Mapping[str, float]]]:
-    """Return the readings of a file with sums: name -> (key in the file, weights of joints), of
-    driven joints by name, each with the name that the file states.
-
-    Raises DriveError: a triangle drive, or a drive that is no sum and moves no joint.
-    """
-    readings: dict[str, tuple[str, Mapping[str, float]]] = {}
-    for key, drive in actuators.items():
-        weights: Mapping[str, float] | None = getattr(drive, "sum", None)
-        if weights is None:
-            raise DriveError(
-                f"actuator {key!r} is a triangle drive together with sums. Let it drive a "
-                f"stage of its "
-                "own in a file of the family stages",
-                key,
-            )
-        if weights:
-            readings[key] = key, weights
-            continue
-        own = [name for name, stated in joints.items() if key in (name, stated)]
-        if not own:
-            raise DriveError(
-                f"actuator {key!r} drives no joint and has no `sum:`. Write 'actuated: {key}' "
-                f"at a joint, or the sum that it reads of {', '.join(joints)}",
-                key,
-            )
-        readings |= {name: (key, {name: 1.0}) for name in own}
-    return readings
-
-
-def check_rows(sums: Mapping[str, Mapping[str, float]], known: Mapping[str, str]) -> None:
-    """Refuse sums, readings and couplings by name with the weights of their joints, that leave a
-    driven joint out or repeat each other. known : driven joint -> its limb.
-    """
-    read = {joint for weights in sums.values() for joint, w in weights.items() if w != 0.0}
-    unread = [joint for joint in known if joint not in read]
-    if unread:
-        raise DriveError(
-            f"joint {unread[0]!r} of limb {known[unread[0]]!r} is in no sum, so no reading states "
-            f"it. Add it to a `sum:`, or list {unread[0]!r} among the actuators",
-            next(iter(sums)),
-        )
-    W = np.array([[weights.get(joint, 0.0) for joint in known] for weights in sums.values()])
-    a, joints = W.shape
-    if a > joints:
-        raise DriveError(
-            f"{a} readings ({', '.join(sums)}) are sums of {joints} joints "
-            f"({', '.join(known)}). Leave out readings",
-            list(sums)[-1],
-        )
-    for i in range(a):
-        if count_independent(W[: i + 1]) <= i:
-            name = list(sums)[i]
-            raise DriveError(
-                f"the weights of the sums are singular: that of actuator {name!r} follows from "
-                f"those of {', '.join(list(sums)[:i])}, so it states nothing new. Correct a weight",
-                name,
-            )
-
-
-def _check_sum(name: str, weights: Mapping[str, float], turning: Mapping[str, bool]) -> None:
-    """Refuse a sum of unknown joints, of unlike joints, or without a weight."""
-    for joint, weight in weights.items():
-        if joint not in turning:
-            raise DriveError(
-                f"the sum of actuator {name!r} names {joint!r}, which no limb states under "
-                f"'actuated:'{suggest_names(joint, list(turning))}. Allowed: "
-                f"{', '.join(turning)}",
-                name,
-            )
-        if not np.isfinite(weight):
-            raise DriveError(
-                f"the weight of {joint!r} in the sum of actuator {name!r} is {weight:g}. Give a "
-                "finite number",
-                name,
-            )
-    if not any(weights.values()):
-        raise DriveError(
-            f"all weights in the sum of actuator {name!r} are zero, so its reading states nothing. "
-            "Give a weight other than 0",
-            name,
-        )
-    angles = [joint for joint in weights if turning[joint]]
-    lengths = [joint for joint in weights if not turning[joint]]
-    if angles and lengths:
-        raise DriveError(
-            f"actuator {name!r} is a sum of the angle {angles[0]!r} and the length {lengths[0]!r}; "
-            "sum joints of one kind, and describe a screw with the `lead:` of its joint",
-            name,
-        )
-
-
-def is_weight(weights: Mapping[str, float], term: str) -> bool:
-    """Return whether an unknown of a drive is a weight of its sum."""
-    return bool(weights) and term.partition(".")[0] == WEIGHT
-
-
-def weight_errors(
-    name: str, drive: object, weights: Mapping[str, float], other: tuple[str, ...]
-) -> ErrorModel:
-    """Return the unknown weights of a sum, `q1.weight.m` ..; `other` are its other terms."""
-    unknown: tuple[str, ...] = getattr(drive, "unknown", ())
-    tolerance: RatioTolerance | None = getattr(drive, "weights", None)
-    joints: list[str] = []
-    for term in unknown:
-        if is_weight(weights, term):  # `weight` means all of a sum
-            joints += weights if term == WEIGHT else [term.partition(".")[2]]
-    errors = []
-    for joint in joints:
-        if joint not in weights:
-            allowed = (*other, WEIGHT, *(f"{WEIGHT}.{known}" for known in weights))
-            raise DriveError(
-                f"actuator {name!r} has no term {WEIGHT + '.' + joint!r}. Allowed: "
-                f"{', '.join(allowed)}",
-                name,
-            )
-        parameter = f"{name}.{WEIGHT}.{joint}"
-        address = Address(name, "transmission", f"{WEIGHT}.{joint}")
-        sd = standard_deviation(tolerance, parameter)
-        entry = LinearMap(parameter, address)
-        errors.append(single_error(parameter, Dimension.RATIO, weights[joint], sd, entry))
-    return join_errors(errors)
+    of, lengths = drive.triangle, (Dimension.LENGTH, drive.length)
+    skew = of.skew.rx, of.skew.ry, of.skew.rz
+    for part, axes, values, (dimension, tolerance) in (
+        ("foot", AXES[3:], of.foot, lengths),
+        ("head", AXES[3:], of.head, lengths),
+        (SKEW, AXES[:3], skew, (Dimension.ANGLE, drive.angle)),
+    ):
+        for axis, nominal, components in zip(axes, values, rotation, strict=True):
+            own = components[:2] if part == SKEW else components
+            is_idle = part == SKEW and np.linalg.norm(own) < ON_AXIS
+            changes = {
+                f"{part}.{name}": float(share)
+                for name, share in zip("xyz", own, strict=False)
+                if abs(share) > 1e-12 and not is_idle
+            }
+            yield f"{part}.{axis}", Term(dimension, nominal, tolerance, changes)

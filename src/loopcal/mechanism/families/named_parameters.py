@@ -11,7 +11,7 @@ import numpy as np
 
 from loopcal.errors import MechanismError
 from loopcal.mechanism.assembly import AXES, Address, LinearMap
-from loopcal.mechanism.families.drives import PlacedCoupling, PlacedDrive, ScrewDrive, SpoolDrive
+from loopcal.mechanism.families.drives import PlacedRow, ScrewDrive, SpoolDrive
 from loopcal.mechanism.families.placement import (
     AngleTolerance,
     ErrorModel,
@@ -85,7 +85,6 @@ class NamedRatio:
 
 
 NamedParameter = NamedLength | NamedAngle | NamedRatio
-Row = PlacedDrive | PlacedCoupling
 
 
 def get_quantity(named: NamedParameter) -> tuple[Dimension, float]:
@@ -123,7 +122,7 @@ def find_engine_axis(name: str, entry: MapEntry) -> tuple[str, float]:
     return entry.axis, coefficient
 
 
-def check_units(named: NamedParameter, entry: MapEntry, drive: Row | None) -> None:
+def check_units(named: NamedParameter, entry: MapEntry, drive: PlacedRow | None) -> None:
     """Refuse a map between unlike units, onto the drive that the entry names; a ratio is a slope
     for an angle.
     """
@@ -159,7 +158,7 @@ def check_units(named: NamedParameter, entry: MapEntry, drive: Row | None) -> No
 
 
 def named_error(
-    named: NamedParameter, limbs: Sequence[PlacedLimb], drives: Mapping[str, Row]
+    named: NamedParameter, limbs: Sequence[PlacedLimb], drives: Mapping[str, PlacedRow]
 ) -> ErrorModel:
     """Return a named parameter with its maps onto limbs and drives."""
     dimension, nominal = get_quantity(named)
@@ -170,7 +169,10 @@ def named_error(
 
 
 def _map_entry(
-    named: NamedParameter, entry: MapEntry, limbs: Sequence[PlacedLimb], drives: Mapping[str, Row]
+    named: NamedParameter,
+    entry: MapEntry,
+    limbs: Sequence[PlacedLimb],
+    drives: Mapping[str, PlacedRow],
 ) -> Iterator[LinearMap]:
     """Yield the maps of one entry, for every copy that it means."""
     name, (axis, coefficient) = named.name, find_engine_axis(named.name, entry)

@@ -19,12 +19,10 @@ from loopcal.mechanism.families.drives import (
     Coupling,
     Drive,
     LoadFrame,
-    complete_drives,
-    couple_joints,
-    coupling_errors,
-    drive_errors,
+    complete_row,
     list_conditions,
-    place_drives,
+    place_rows,
+    row_errors,
 )
 from loopcal.mechanism.families.named_parameters import NamedParameter, named_error
 from loopcal.mechanism.families.placement import (
@@ -196,21 +194,20 @@ class RobotRecord:
         """
         columns = {name: of for name, of in self.conditions.items() if name not in FORCES}
         conditions = tuple(list_conditions(columns))
-        limbs, couplings = couple_joints(limbs, self.drives, self.couplings, columns)
-        drives = place_drives(limbs, self.drives, own, couplings)
-        rows = {**drives, **{coupling.name: coupling for coupling in couplings}}
+        limbs, drives, couplings = place_rows(
+            tuple(limbs), self.drives, own, self.couplings, columns
+        )
+        rows = {**drives, **couplings}
         errors = join_errors(
             (
                 errors,
-                *(drive_errors(drive) for drive in drives.values()),
-                *(coupling_errors(coupling) for coupling in couplings),
+                *map(row_errors, rows.values()),
                 *(named_error(named, limbs, rows) for named in self.parameters),
             )
         )
         if complete is not None:
-            all_errors = complete_limbs(limbs, complete) + complete_drives(
-                drives, couplings, complete
-            )
+            every = [complete_row(row, complete) for row in {**couplings, **drives}.values()]
+            all_errors = complete_limbs(limbs, complete) + join_errors(every)
             errors = all_errors.without_effects_of(errors) + errors
         return Assembly(
             self.name,
@@ -229,7 +226,7 @@ class RobotRecord:
             self.tool.matrix,
             self.workspace.ranges,
             self.source,
-            couplings=tuple(coupling.actuator for coupling in couplings),
+            couplings=tuple(coupling.actuator for coupling in couplings.values()),
         )
 
     def assembly(self, expanded: Assembly | None = None) -> Assembly:

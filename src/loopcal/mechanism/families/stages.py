@@ -31,9 +31,9 @@ from loopcal.mechanism.families.drives import (
     LoadFrame,
     NamedTriangleDrive,
     StrokeError,
-    drive_errors,
-    place_drives,
+    place_rows,
     refuse_idle_drives,
+    row_errors,
 )
 from loopcal.mechanism.families.limb_records import (
     ORIGIN,
@@ -427,11 +427,11 @@ def expand_joint(
             "drives",
             drive,
         )
-    placed = place_drives([limb], {drive: triangle} if triangle else stated, [own])[drive]
+    placed = place_rows([limb], {drive: triangle} if triangle else stated, [own]).drives[drive]
     errors = join_errors(
         (
             *(_joint_error(record, limb, drive, error) for error in record.errors),
-            drive_errors(placed),
+            row_errors(placed),
             *(
                 displacement_error(
                     f"platform.{axis}", limb, "platform", axis, _tolerance(record, axis)
