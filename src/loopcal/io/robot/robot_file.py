@@ -42,11 +42,10 @@ from loopcal.io.core.yaml_file import (
     remove_key,
 )
 from loopcal.io.data.columns import find_column_fault
-from loopcal.mechanism.assembly import Assembly
 from loopcal.mechanism.compilation import build, find_impossible_values
 from loopcal.mechanism.families import FAMILIES
 from loopcal.mechanism.families.placement import RecordError
-from loopcal.mechanism.families.records import RobotRecord, match_parameter_names
+from loopcal.mechanism.families.records import RobotRecord
 from loopcal.mechanism.model import Mechanism
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension, find_unit, to_si
@@ -211,7 +210,11 @@ def build_robot(file: YamlFile) -> Mechanism:
             record = place_stages(file, record, units)
         symbols = {dimension: unit.symbol for dimension, unit in units.items()}
         origin = RobotSource(file, record)
-        robot = build(_assemble(record, file), symbols, origin)
+        try:
+            assembly = record.assembly()
+        except RecordError as error:
+            raise file.error(str(error), _find_drives(file, error.location)) from None
+        robot = build(assembly, symbols, origin)
         commanded = [actuator for actuator in robot.actuators if actuator.reference is None]
         for actuator in commanded:  # measurement files have them as columns
             if fault := find_column_fault(actuator.name, "actuator"):
@@ -327,30 +330,6 @@ def _find_drives(file: YamlFile, location: Location) -> Location:
     """Return a location in a file that states its drives under their older key."""
     older = location[:1] == ("drives",) and "drives" not in file.content
     return ("actuators", *location[1:]) if older else location
-
-
-def _assemble(record: RobotRecord, file: YamlFile) -> Assembly:
-    """Return the assembly of a record; an unknown name in a list of parameters, and a common error
-    that cannot be, are refused at their line.
-    """
-    try:
-        expanded = record.expand()
-    except RecordError as error:
-        raise file.error(str(error), _find_drives(file, error.location)) from None
-    parameters = expanded.parameters
-    names = [parameter.name for parameter in parameters]
-    for key in ("fixed", "stored_parameters"):
-        for i, pattern in enumerate(getattr(record, key)):
-            try:
-                match_parameter_names(pattern, names, key)
-            except MechanismError as error:
-                raise file.error(str(error), (key, i)) from None
-    for i, common in enumerate(record.common_errors):
-        try:
-            common.resolve(parameters)
-        except MechanismError as error:
-            raise file.error(str(error), ("common_errors", i)) from None
-    return record.assembly(expanded)
 
 
 OWN_KEYS = ("on", "mount", "joint", "family")

@@ -59,44 +59,46 @@ class CommonErrorRecord:
     angle: AngleTolerance | None = None
     ratio: RatioTolerance | None = None
 
-    def resolve(self, parameters: Sequence[Parameter]) -> CommonError:
-        """Return the common error of the parameters that match; raises MechanismError for unlike
-        parameters, a single one, or one without a tolerance of its own.
+    def resolve(self, parameters: Sequence[Parameter], place: int) -> CommonError:
+        """Return the common error of the parameters that match; raises RecordError for unlike
+        parameters, a single one, or one without a tolerance of its own. place : in the list of the
+        file.
         """
+        at = ("common_errors", place)
         stated = {d: t for d in Dimension if (t := getattr(self, d.value, None)) is not None}
         if len(stated) != 1:
-            raise MechanismError(
+            raise RecordError(
                 f"common error {self.name!r} states {len(stated)} tolerances. Give one, such as "
-                "`length: {sd: 0.1}`"
+                "`length: {sd: 0.1}`",
+                *at,
             )
         ((dimension, tolerance),) = stated.items()
         sd = standard_deviation(tolerance, f"common error {self.name!r}")
         assert sd is not None
-        names = [parameter.name for parameter in parameters]
-        matching = _match_all(self.of, names, "common_errors")
+        matching = match_parameter_names(self.of, [p.name for p in parameters], *at, "of")
         chosen = [parameter for parameter in parameters if parameter.name in matching]
         for parameter in chosen:
-            self._check(parameter, dimension)
+            place_of = f"common error {self.name!r} of {parameter.name}"
+            if parameter.dimension is not dimension:
+                raise RecordError(
+                    f"{place_of} states a tolerance of {dimension.value}, but the parameter is of "
+                    f"dimension {parameter.dimension.value}. Use the key "
+                    f"`{parameter.dimension.value}`",
+                    *at,
+                )
+            if parameter.tolerance is None:
+                raise RecordError(
+                    f"{place_of}: the parameter has no separate tolerance. Give it, because no two "
+                    "parts are exactly equal",
+                    *at,
+                )
         if len(chosen) < 2:
-            raise MechanismError(
+            raise RecordError(
                 f"common error {self.name!r} belongs to {chosen[0].name} alone. Name two or "
-                f"more parameters, or give the tolerance of that parameter"
+                f"more parameters, or give the tolerance of that parameter",
+                *at,
             )
         return CommonError(self.name, tuple(parameter.name for parameter in chosen), sd)
-
-    def _check(self, parameter: Parameter, dimension: Dimension) -> None:
-        """Refuse a parameter that cannot have this common error."""
-        place = f"common error {self.name!r} of {parameter.name}"
-        if parameter.dimension is not dimension:
-            raise MechanismError(
-                f"{place} states a tolerance of {dimension.value}, but the parameter is of "
-                f"dimension {parameter.dimension.value}. Use the key `{parameter.dimension.value}`"
-            )
-        if parameter.tolerance is None:
-            raise MechanismError(
-                f"{place}: the parameter has no separate tolerance. Give it, because no two "
-                "parts are exactly equal"
-            )
 
 
 @dataclass(frozen=True)
@@ -229,20 +231,19 @@ class RobotRecord:
             couplings=tuple(coupling.actuator for coupling in couplings.values()),
         )
 
-    def assembly(self, expanded: Assembly | None = None) -> Assembly:
+    def assembly(self) -> Assembly:
         """Return the expanded robot, with the parameters of `fixed` kept at their nominal values,
         the names of those that the controller stores, and the common errors of the others.
         """
-        expanded = self.expand() if expanded is None else expanded
+        expanded = self.expand()
         names = [parameter.name for parameter in expanded.parameters]
-        fixed = _match_all(self.fixed, names, "fixed")
-        stored = _match_all(self.stored_parameters, names, "stored_parameters")
+        fixed = match_parameter_names(self.fixed, names, "fixed")
+        stored = match_parameter_names(self.stored_parameters, names, "stored_parameters")
+        stored.update(expanded.stored_parameters)
         parameters = tuple(
             replace(p, free=False) if p.name in fixed else p for p in expanded.parameters
         )
-        stored.update(expanded.stored_parameters)
-        present = tuple(name for name in names if name in stored)
-        own = (record.resolve(parameters) for record in self.common_errors)
+        own = (record.resolve(parameters, i) for i, record in enumerate(self.common_errors))
         common = (*expanded.common_errors, *own)
         titles = [error.name for error in common]
         if duplicate := [title for title in titles if titles.count(title) > 1]:
@@ -261,26 +262,27 @@ class RobotRecord:
         return replace(
             expanded,
             parameters=parameters,
-            stored_parameters=present,
+            stored_parameters=tuple(name for name in names if name in stored),
             common_errors=common,
             load=load,
         )
 
 
-def _match_all(patterns: Iterable[str], names: Sequence[str], key: str) -> set[str]:
-    """Return the parameters that match any of these names or patterns."""
-    return {n for pattern in patterns for n in match_parameter_names(pattern, names, key)}
-
-
-def match_parameter_names(pattern: str, names: Sequence[str], key: str = "fixed") -> list[str]:
-    """Return the parameters that match a name or pattern; raises MechanismError if none does."""
-    matching = fnmatch.filter(names, pattern)
-    if not matching:
-        hint = suggest_names(pattern, names) or f"; its parameters are {', '.join(names)}"
-        raise MechanismError(
-            f"{pattern!r} under `{key}` matches no parameter of this robot{hint}. Correct it"
-        )
-    return matching
+def match_parameter_names(
+    patterns: Sequence[str], names: Sequence[str], *key: str | int
+) -> set[str]:
+    """Return the parameters that match any of these names or patterns, which a file lists at `key`;
+    raises RecordError for one that none matches.
+    """
+    found: set[str] = set()
+    for i, pattern in enumerate(patterns):
+        matching = fnmatch.filter(names, pattern)
+        if not matching:
+            hint = suggest_names(pattern, names) or f"; its parameters are {', '.join(names)}"
+            sentence = f"{pattern!r} under `{key[0]}` matches no parameter of this robot{hint}"
+            raise RecordError(f"{sentence}. Correct it", *key, i)
+        found.update(matching)
+    return found
 
 
 def values_per_leg(value: float | tuple[float, ...], count: int, name: str) -> tuple[float, ...]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
@@ -31,9 +31,7 @@ from loopcal.mechanism.families.drives import (
     LoadFrame,
     NamedTriangleDrive,
     StrokeError,
-    place_rows,
     refuse_idle_drives,
-    row_errors,
 )
 from loopcal.mechanism.families.limb_records import (
     ORIGIN,
@@ -42,7 +40,13 @@ from loopcal.mechanism.families.limb_records import (
     axis_vector,
     matrix_from_place,
 )
-from loopcal.mechanism.families.named_parameters import Freedom
+from loopcal.mechanism.families.named_parameters import (
+    Freedom,
+    MapEntry,
+    NamedAngle,
+    NamedLength,
+    NamedParameter,
+)
 from loopcal.mechanism.families.placement import (
     AngleTolerance,
     ErrorModel,
@@ -79,8 +83,10 @@ def check_stage_names(names: Sequence[str], parents: Sequence[str | None]) -> li
     """Return what each stage is on: BASE, or an earlier stage; None stands for the previous one."""
     if not names:
         raise StageError(
-            ("there are no stages. List the coordinates of the chain, from the base on"), 0
+            "there are no stages. List the coordinates of the chain, from the base on", 0
         )
+    previous = [BASE, *names]
+    stated = [previous[i] if on is None else on for i, on in enumerate(parents)]
     for i, name in enumerate(names):
         if name in names[:i]:
             raise StageError(f"two stages are called {name!r}. Give each its own name", i)
@@ -90,95 +96,85 @@ def check_stage_names(names: Sequence[str], parents: Sequence[str | None]) -> li
                 f"than {BASE!r}",
                 i,
             )
-    previous = [BASE, *names]
-    stated = [previous[i] if on is None else on for i, on in enumerate(parents)]
-    for i, on in enumerate(stated):
-        if on not in (BASE, *names):
+    for i, (name, on) in enumerate(zip(names, stated, strict=True)):
+        if on not in previous:
             raise StageError(
-                f"stage {names[i]!r} is on {on!r}, which is not a stage"
+                f"stage {name!r} is on {on!r}, which is not a stage"
                 f"{suggest_names(on, names[:i])}. Allowed: {', '.join((BASE, *names[:i]))}",
                 i,
             )
-    for i, on in enumerate(stated):
+        path, under = [name], on
+        while under != BASE and under in names and under not in path:
+            path.append(under)
+            under = stated[names.index(under)]
+        if under == name:
+            raise StageError(
+                f"the stages form a cycle: {' on '.join([*path, under])}; attach one of them to "
+                f"{BASE!r} or to an earlier stage",
+                i,
+            )
         if on in names[i:]:
-            _refuse_later(names, stated, i)
+            raise StageError(
+                f"stage {name!r} is on {on!r}, which is listed behind it. List {on!r} first", i
+            )
     return stated
-
-
-def _refuse_later(names: Sequence[str], parents: Sequence[str], i: int) -> None:
-    """Refuse a stage that is attached to a later one, or through others to itself."""
-    path, on = [names[i]], parents[i]
-    while on != BASE and on not in path:
-        path.append(on)
-        on = parents[names.index(on)]
-    if on == names[i]:
-        circle = " on ".join([*path, on])
-        raise StageError(
-            f"the stages form a cycle: {circle}; attach one of them to {BASE!r} or to an earlier "
-            "stage",
-            i,
-        )
-    raise StageError(
-        f"stage {names[i]!r} is on {parents[i]!r}, which is listed behind it. List "
-        f"{parents[i]!r} first",
-        i,
-    )
 
 
 def join_stages(record: Stages, stages: Sequence[AttachedStage]) -> Assembly:
     """Return the assembly of a chain; its home is found when it is compiled."""
     _refuse_wrong_drives(stages)
-    assemblies = [(stage.name, stage.assembly) for stage in stages]
+    parts = [_add_prefix(stage.name, stage.assembly) for stage in stages]
+    joined: dict[str, Any] = {
+        name: tuple(item for part in parts for item in getattr(part, name))
+        for name in (
+            *("limbs", "actuators", "couplings", "parameters", "maps", "shared"),
+            *("stored_parameters", "common_errors"),
+        )
+    }
     return Assembly(
         record.name,
-        tuple(
-            replace(limb, name=f"{prefix}.{limb.name}")
-            for prefix, part in assemblies
-            for limb in part.limbs
-        ),
-        tuple(actuator for _, part in assemblies for actuator in part.actuators),
-        AXES,
-        record.controlled,
-        stages[-1].mount,
-        tuple(
-            replace(parameter, name=f"{prefix}.{parameter.name}")
-            for prefix, part in assemblies
-            for parameter in part.parameters
-        ),
-        tuple(
-            replace(
-                entry,
-                parameter=f"{prefix}.{entry.parameter}",
-                address=_rename_address(prefix, part, entry.address),
-            )
-            for prefix, part in assemblies
+        freedoms=AXES,
+        controlled=record.controlled,
+        home=stages[-1].mount,
+        tool=record.tool.matrix,
+        workspace=record.workspace.ranges,
+        source=record.source,
+        stages=tuple(stages),
+        held=record.held,
+        **joined,
+    )
+
+
+def _add_prefix(stage: str, part: Assembly) -> Assembly:
+    """Return an assembly with the stage before the names of limbs and parameters; actuators and
+    couplings keep theirs.
+    """
+    rows = {row.name for row in part.rows}
+
+    def name(own: str) -> str:
+        return f"{stage}.{own}"
+
+    def rename(address: Address) -> Address:
+        is_row = address.element == "transmission" and address.owner in rows
+        return address if is_row else replace(address, owner=name(address.owner))
+
+    return replace(
+        part,
+        limbs=tuple(replace(limb, name=name(limb.name)) for limb in part.limbs),
+        parameters=tuple(replace(p, name=name(p.name)) for p in part.parameters),
+        maps=tuple(
+            replace(entry, parameter=name(entry.parameter), address=rename(entry.address))
             for entry in part.maps
         ),
-        tuple(
-            replace(
-                shared,
-                inputs=tuple(f"{prefix}.{name}" for name in shared.inputs),
-                outputs=tuple(_rename_address(prefix, part, address) for address in shared.outputs),
-            )
-            for prefix, part in assemblies
-            for shared in part.shared
+        shared=tuple(
+            replace(of, inputs=tuple(map(name, of.inputs)), outputs=tuple(map(rename, of.outputs)))
+            for of in part.shared
         ),
-        record.tool.matrix,
-        record.workspace.ranges,
-        record.source,
-        tuple(f"{prefix}.{name}" for prefix, part in assemblies for name in part.stored_parameters),
-        tuple(
-            replace(
-                error,
-                name=f"{prefix}.{error.name}",
-                parameters=tuple(f"{prefix}.{name}" for name in error.parameters),
-            )
-            for prefix, part in assemblies
+        stored_parameters=tuple(map(name, part.stored_parameters)),
+        common_errors=tuple(
+            replace(error, name=name(error.name), parameters=tuple(map(name, error.parameters)))
             for error in part.common_errors
         ),
-        tuple(stages),
-        held=record.held,
-        couplings=tuple(row for _, part in assemblies for row in part.couplings),
     )
 
 
@@ -202,13 +198,6 @@ def _refuse_wrong_drives(stages: Sequence[AttachedStage]) -> None:
                     i,
                 )
         owner |= dict.fromkeys(own, stage.name)
-
-
-def _rename_address(prefix: str, part: Assembly, address: Address) -> Address:
-    """Return an address with the names of the chain; actuators and couplings keep theirs."""
-    if address.element == "transmission" and address.owner in {a.name for a in part.rows}:
-        return address
-    return replace(address, owner=f"{prefix}.{address.owner}")
 
 
 JointError = Literal[Freedom, "offset", "gain"]
@@ -324,24 +313,15 @@ class PlacedStages(Stages):
 
     def expand(self) -> Assembly:
         """Return the assembly of all stages; raises StageError where they do not fit together."""
-        if self.parameters:
-            raise RecordError(
-                f"{self.name} states `parameters:` of a whole chain. Give them in a stage that "
-                "has a `family:`",
-                "parameters",
-            )
-        others = [name for name in self.conditions if name not in FORCES]
-        if self.couplings or others:
-            raise RecordError(
-                f"{self.name} couples joints of different stages. Describe these stages as "
-                f"one robot of family limbs, with `couplings:`",
-                "couplings" if self.couplings else "conditions",
-            )
-        if self.home != PoseRecord():
-            raise MechanismError(
-                f"{self.name} states `home:`, but the home of a chain comes from its stages. Give "
-                "`start:` of a joint or `home:` of a stage"
-            )
+        own_rows = "Describe these stages as one robot of family limbs, with `couplings:`"
+        for key, is_stated, remedy in (
+            ("parameters", bool(self.parameters), "Give them in a stage that has a `family:`"),
+            ("couplings", bool(self.couplings), own_rows),
+            ("conditions", any(name not in FORCES for name in self.conditions), own_rows),
+            ("home", self.home != PoseRecord(), "Give `start:` of a joint or `home:` of a stage"),
+        ):
+            if is_stated:
+                raise RecordError(f"{self.name} states `{key}:` of a whole chain. {remedy}", key)
         names = [stage.name for stage in self.stages]
         parents = check_stage_names(names, [stage.on for stage in self.stages])
         assemblies, strokes = list[Assembly](), dict[str, str]()
@@ -370,24 +350,15 @@ class PlacedStages(Stages):
                 angle=stage.joint.angle or self.tolerances.angles,
             )
             return expand_joint(stage.name, joint, self.drives)
-        if robot is None:
-            raise StageError(
-                f"stage {stage.name!r} is neither a joint nor a robot. Write 'joint:', or "
-                "'family:' with the keys of that family",
-                i,
-            )
-        if robot.tool != PoseRecord():
-            raise StageError(
-                f"stage {stage.name!r} states a tool. Give it for the whole robot, or as the "
-                "mount of the next stage",
-                i,
-            )
-        if robot.load != LoadFrame() or any(name in FORCES for name in robot.conditions):
-            raise StageError(
-                f"stage {stage.name!r} states a load; state it for the whole robot, whose end "
-                "platform it acts on",
-                i,
-            )
+        assert robot is not None
+        is_loaded = robot.load != LoadFrame() or any(name in FORCES for name in robot.conditions)
+        for key, is_stated, remedy in (
+            ("tool", robot.tool != PoseRecord(), "or as the mount of the next stage"),
+            ("load", is_loaded, "whose end platform it acts on"),
+        ):
+            if is_stated:
+                sentence = f"stage {stage.name!r} states a {key}. Give it for the whole robot"
+                raise StageError(f"{sentence}, {remedy}", i)
         try:
             own = robot.assembly()
             drives = _select_drives(self.drives, [actuator.name for actuator in own.actuators])
@@ -427,23 +398,20 @@ def expand_joint(
             "drives",
             drive,
         )
-    placed = place_rows([limb], {drive: triangle} if triangle else stated, [own]).drives[drive]
-    errors = join_errors(
-        (
-            *(_joint_error(record, limb, drive, error) for error in record.errors),
-            row_errors(placed),
-            *(
-                displacement_error(
-                    f"platform.{axis}", limb, "platform", axis, _tolerance(record, axis)
-                )
-                for axis in record.platform_errors
-            ),
-        )
+    of_platform = [_name_displacement(record, axis) for axis in record.platform_errors]
+    robot = RobotRecord(
+        name, drives={drive: triangle} if triangle else stated, parameters=tuple(of_platform)
     )
-    own_readings = (placed.actuator, *([placed.load] if placed.load else []))
-    return Assembly(
-        name, (limb.limb,), own_readings, AXES, (), np.eye(4), errors.parameters, errors.maps
-    )
+    errors = join_errors(_joint_error(record, limb, drive, error) for error in record.errors)
+    return robot.assemble([limb], errors, freedoms=AXES, controlled=(), own=[own])
+
+
+def _name_displacement(record: SerialRotation | SerialSlide, axis: Freedom) -> NamedParameter:
+    """Return a displacement of the platform of a serial joint as a parameter."""
+    name, maps = f"platform.{axis}", (MapEntry(LIMB, "platform", axis),)
+    if get_axis_dimension(axis) is Dimension.ANGLE:
+        return NamedAngle(name, 0.0, maps, record.angle)
+    return NamedLength(name, 0.0, maps, record.length)
 
 
 def _refuse_terms_beside_triangle(record: SerialRotation | SerialSlide, drive: str) -> None:
@@ -469,18 +437,10 @@ def _joint_error(
         gain = LinearMap(error, Address(drive, "transmission", error))
         sd = standard_deviation(record.ratio, error)
         return single_error(error, Dimension.RATIO, record.gain, sd, gain, positive=True)
+    turns = record.kind == "R" if error == "offset" else error in AXES[:3]
+    sd = standard_deviation(record.angle if turns else record.length, error)
     if error == "offset":
-        dimension = Dimension.ANGLE if record.kind == "R" else Dimension.LENGTH
-        tolerance = record.angle if record.kind == "R" else record.length
-        return offset_error(error, drive, dimension, 0.0, standard_deviation(tolerance, error))
+        return offset_error(error, drive, Dimension.ANGLE if turns else Dimension.LENGTH, 0.0, sd)
     place = limb.placements[LINK]
-    nominal = 0.0
-    if error in AXES[3:]:
-        nominal = float((place[:3, :3].T @ place[:3, 3])["xyz".index(error)])
-    return displacement_error(error, limb, LINK, error, _tolerance(record, error), nominal)
-
-
-def _tolerance(record: SerialRotation | SerialSlide, axis: str) -> float | None:
-    """Return the tolerance of a displacement along or about an axis."""
-    turns = get_axis_dimension(axis) is Dimension.ANGLE
-    return standard_deviation(record.angle if turns else record.length, axis)
+    at = 0.0 if turns else float((place[:3, :3].T @ place[:3, 3])["xyz".index(error)])
+    return displacement_error(error, limb, LINK, error, sd, at)
