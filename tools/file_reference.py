@@ -25,7 +25,7 @@ from loopcal.io.runs.run_folder import MADE_BY
 from loopcal.measure.kinds import KINDS
 from loopcal.measure.kinds.kind import Column, Kind
 from loopcal.mechanism.families import FAMILIES
-from loopcal.mechanism.families.limb_records import Axis
+from loopcal.mechanism.families.limbs import Axis
 from loopcal.mechanism.families.records import RobotRecord
 from loopcal.studies.files.study_file import LEVELS
 from loopcal.studies.specification.levels import Question, Scores

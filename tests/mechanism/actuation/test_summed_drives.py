@@ -510,7 +510,7 @@ SECOND, THIRD = "q2: {reads: length, sum: {m: 1, k: 2}}", "q3: {reads: length, s
 @pytest.mark.parametrize(
     ("old", "new", "sentence", "line"),
     [
-        (SECOND, "q2: {reads: length, sum: {m: 1, kk: 2}}", "names 'kk', which is neither a drive", 9),
+        (SECOND, "q2: {reads: length, sum: {m: 1, kk: 2}}", "names 'kk', which is neither", 9),
         (SECOND, "q2: {reads: length, sum: {m: 1, h: 2}}", "'k' of limb 'K' is in no sum", 8),
         (SECOND, "q2: {reads: length, sum: {m: 2, n: 2}}\n  k: {reads: length}",
          "singular: that of actuator 'q2' follows", 9),

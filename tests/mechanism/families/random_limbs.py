@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 from loopcal import engine, geometry
 from loopcal.engine import State
 from loopcal.mechanism.compilation import build
-from loopcal.mechanism.families.limb_records import JointRecord, LimbRecord, Prismatic, Revolute
-from loopcal.mechanism.families.limbs import Limbs
+from loopcal.mechanism.families.limbs import JointRecord, LimbRecord, Limbs, Prismatic, Revolute
 from loopcal.mechanism.families.placement import Point, PoseRecord
 from loopcal.mechanism.kinematics import compute_readings
 from loopcal.mechanism.model import Mechanism

@@ -11,12 +11,10 @@ from numpy.typing import NDArray
 from loopcal import geometry
 from loopcal.mechanism.compilation import build
 from loopcal.mechanism.families.drives import LengthDrive
-from loopcal.mechanism.families.limb_records import Copies, LimbRecord, Prismatic, Shifts
-from loopcal.mechanism.families.limbs import Limbs
+from loopcal.mechanism.families.limbs import Copies, LimbRecord, Limbs, Prismatic, Shifts
 from loopcal.mechanism.families.linear_delta import LinearDelta
-from loopcal.mechanism.families.named_parameters import MapEntry, NamedLength
 from loopcal.mechanism.families.placement import PoseRecord
-from loopcal.mechanism.families.records import Workspace
+from loopcal.mechanism.families.records import MapEntry, NamedLength, Workspace
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.sensitivity import differentiate_pose
 from loopcal.mechanism.solutions import forward, inverse

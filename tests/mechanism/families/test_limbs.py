@@ -15,9 +15,10 @@ from loopcal.errors import LoopcalError, MechanismError
 from loopcal.io.robot.robot_file import find_robot_file, list_shipped_robots, load_robot
 from loopcal.mechanism.compilation import build
 from loopcal.mechanism.families.drives import AngleDrive, LengthDrive, SpoolDrive
-from loopcal.mechanism.families.limb_records import (
+from loopcal.mechanism.families.limbs import (
     Copies,
     LimbRecord,
+    Limbs,
     Prismatic,
     Revolute,
     RodCone,
@@ -25,10 +26,9 @@ from loopcal.mechanism.families.limb_records import (
     Tilts,
     Universal,
 )
-from loopcal.mechanism.families.limbs import Limbs
-from loopcal.mechanism.families.named_parameters import MapEntry, NamedAngle, NamedLength
 from loopcal.mechanism.families.placement import LengthTolerance, PoseRecord
 from loopcal.mechanism.families.prs import ThreePrs
+from loopcal.mechanism.families.records import MapEntry, NamedAngle, NamedLength
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.sensitivity import differentiate_pose
 from loopcal.mechanism.solutions import forward, inverse

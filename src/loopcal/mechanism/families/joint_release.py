@@ -19,16 +19,16 @@ import numpy as np
 from loopcal.errors import MechanismError
 from loopcal.findings import Finding, report_finding
 from loopcal.mechanism.compilation import build
-from loopcal.mechanism.families.limb_records import (
+from loopcal.mechanism.families.limbs import (
     JointRecord,
     LimbRecord,
+    Limbs,
     Prismatic,
     Revolute,
     Spherical,
     Universal,
     axis_vector,
 )
-from loopcal.mechanism.families.limbs import Limbs
 from loopcal.mechanism.families.placement import frame_from_axis
 from loopcal.mechanism.kinematics import compute_limb_frames, forward_trials
 from loopcal.mechanism.model import Mechanism

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -33,6 +33,7 @@ from loopcal.units import SD_RANGE, Angle, Dimension, Length, Ratio, is_sd
 # Limbs with joints about any axis, placed one after the other, in the form of the engine.
 
 EX, EY, EZ = np.eye(3)
+Freedom = Literal["rx", "ry", "rz", "x", "y", "z"]
 
 
 class RecordError(MechanismError):

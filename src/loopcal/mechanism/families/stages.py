@@ -33,20 +33,7 @@ from loopcal.mechanism.families.drives import (
     StrokeError,
     refuse_idle_drives,
 )
-from loopcal.mechanism.families.limb_records import (
-    ORIGIN,
-    Axis,
-    Place,
-    axis_vector,
-    matrix_from_place,
-)
-from loopcal.mechanism.families.named_parameters import (
-    Freedom,
-    MapEntry,
-    NamedAngle,
-    NamedLength,
-    NamedParameter,
-)
+from loopcal.mechanism.families.limbs import ORIGIN, Axis, Place, axis_vector, matrix_from_place
 from loopcal.mechanism.families.placement import (
     AngleTolerance,
     ErrorModel,
@@ -66,7 +53,14 @@ from loopcal.mechanism.families.placement import (
     standard_deviation,
     strip_number,
 )
-from loopcal.mechanism.families.records import RobotRecord
+from loopcal.mechanism.families.records import (
+    Freedom,
+    MapEntry,
+    NamedAngle,
+    NamedLength,
+    NamedParameter,
+    RobotRecord,
+)
 from loopcal.units import Angle, Dimension, Length, Ratio
 
 # The assembly of a chain: those of its stages, with the stage before each name.

@@ -35,8 +35,7 @@ from loopcal.io.formats.program_format import (
     report_changes,
 )
 from loopcal.mechanism.assembly import BASE, PLATFORM
-from loopcal.mechanism.families.limb_records import Prismatic, Revolute, matrix_from_place
-from loopcal.mechanism.families.limbs import Limbs
+from loopcal.mechanism.families.limbs import Limbs, Prismatic, Revolute, matrix_from_place
 from loopcal.mechanism.families.stages import PlacedStages
 from loopcal.mechanism.joint_graph.graph import GraphJoint, choose_coordinates
 from loopcal.mechanism.joint_graph.loops import (
