@@ -8,7 +8,7 @@ import pytest
 
 import loopcal as lc
 from loopcal.errors import DataError, FileError, LoopcalError
-from loopcal.io.core.yaml_file import make_round_trip_yaml, parse_yaml
+from loopcal.io.core.yaml_file import make_yaml, parse_yaml
 from loopcal.io.formats.linkages.closures import read_mechanism
 from loopcal.io.formats.linkages.urdf import read_tree
 from loopcal.io.robot.robot_file import build_robot, find_robot_file
@@ -24,7 +24,7 @@ WRONG = (..., {}, [], [None], {"rod": 1}, "x", 1e160, -1e308, None, True, [[1]],
 @pytest.mark.parametrize("name", ROBOTS)
 def test_a_wrong_value_in_a_robot_file_is_refused_or_builds_a_robot(name) -> None:
     """Every place is tried with one wrong value, a different one at each."""
-    plain = make_round_trip_yaml().load(find_robot_file(name).read_text("utf-8"))
+    plain = make_yaml().load(find_robot_file(name).read_text("utf-8"))
     document = json.loads(json.dumps(plain))
     refused, places = 0, list(list_places(document))
     for i, place in enumerate(places):

@@ -431,7 +431,7 @@ def _read_settings(path: Path, text: str) -> tuple[YamlFile, int]:
         return sidecar, 0
     text = "\n".join(line[1:] for line in lines)
     if not any(line.strip() and not line.strip().startswith("#") for line in text.splitlines()):
-        return YamlFile(path, "", {}, {}), len(lines)
+        return YamlFile(path, "", {}), len(lines)
     try:
         # `# key: value` leaves one blank before each key, the same for all
         return parse_yaml(text, path, "front matter"), len(lines)

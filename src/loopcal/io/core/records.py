@@ -23,13 +23,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
 from loopcal.errors import FileError, UnitError, suggest_names
-from loopcal.io.core.yaml_file import (
-    Location,
-    YamlFile,
-    has_child,
-    name_location,
-    refuse_unknown_keys,
-)
+from loopcal.io.core.yaml_file import Location, YamlFile, name_location, refuse_unknown_keys
 from loopcal.plain_text import quote
 from loopcal.units import Dimension, Unit, find_unit, list_symbols, to_si
 
@@ -189,7 +183,7 @@ class _RecordReader:
             return record(**values)
         except ValueError as error:  # what the record itself says of its values
             key, _, fact = str(error).partition(" ")
-            if has_child(node, key):  # its text begins with the key that is wrong
+            if key in node:  # its text begins with the key that is wrong
                 raise _MisfitError(f"{_name((*at, key))} {fact}", "", (*at, key)) from None
             raise _MisfitError(f"{_name(at)}: {error}", "", at) from None
 

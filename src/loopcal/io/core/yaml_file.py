@@ -9,7 +9,7 @@ import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,7 @@ from loopcal.units import Dimension, parse_quantity
 Location = tuple[str | int, ...]
 
 KEPT_TEXTS, KEPT_LENGTH = 32, 100_000
-"""Texts whose trees are kept, and their largest length. A command reads the same text several times
+"""Texts whose nodes are kept, and their largest length. A command reads the same text several times
 (it is looked at before it is used), which takes as long as a fit.
 """
 
@@ -43,32 +43,25 @@ _DIRECTIVE = re.compile(r"(?:\s*(?:#.*)?\n)*%(?!YAML 1\.2\s)")
 class YamlFile:
     """A mapping read from a YAML file.
 
-    `tree` is ruamel.yaml's round-trip tree, which keeps lines and comments; `content` the same as
-    plain dicts, lists, text, finite numbers, booleans and None. The YAML text begins at
-    `first_line`, which is later than 1 for front matter.
+    `content` is plain: dicts, lists, text, finite numbers, booleans and None; `lines` are those of
+    its keys and items, from 0. The YAML text begins at `first_line`, which is later than 1 for
+    front matter.
     """
 
     path: Path
     text: str
-    tree: Any
     content: dict[str, Any]
+    lines: Mapping[Location, int] = field(default_factory=dict)
     first_line: int = 1
 
     def line(self, location: Location) -> int:
         """Return the line of the node at `location`; steps that do not exist are ignored."""
-        node, line = self.tree, 0
-        for step in location:
-            if has_child(node, step):
-                with suppress(AttributeError, KeyError, TypeError, IndexError):  # line unknown
-                    places: Any = node
-                    find = places.lc.key if isinstance(node, Mapping) else places.lc.item
-                    line = int(find(step)[0])
-                node = node[step]
-        return line + self.first_line
+        known = (location[:n] for n in range(len(location), 0, -1) if location[:n] in self.lines)
+        return self.lines.get(next(known, ()), 0) + self.first_line
 
     def error(self, sentence: Any, location: Location = ()) -> FileError:
         """Return an error at the line of `location`, or without a line where it does not exist."""
-        exists = bool(location) and has_child(self.tree, location[0])
+        exists = location[:1] in self.lines
         return FileError(sentence, self.path, self.line(location) if exists else None)
 
     def quantity(self, node: Any, dimension: Dimension, location: Location) -> float:
@@ -97,13 +90,11 @@ def parse_yaml(
     YAML_SIZE.check(len(text), what, path)
     is_ours = not has_names or _KNOWN_KEY.search(text) is not None
     with _hide_content(path, what) if not is_ours else nullcontext():
-        tree = _load_tree(text, path, what, first_line)
-    if not isinstance(tree, Mapping):
+        content, lines = _load_content(text, path, what, first_line, has_names)
+    if not isinstance(content, dict):
         sentence = f"this {what} contains no 'key: value' lines. See the examples of loopcal"
         raise FileError(sentence, path)
-    file = YamlFile(path, text, tree, {}, first_line)
-    with _hide_content(path, what) if not is_ours else nullcontext():
-        return replace(file, content=_to_plain(tree, file, (), has_names))
+    return YamlFile(path, text, content, lines, first_line)
 
 
 @contextmanager
@@ -118,20 +109,19 @@ def _hide_content(path: Path, what: str) -> Iterator[None]:
         raise FileError(finding, path, error.line) from None
 
 
-def _load_tree(text: str, path: Path, what: str, first_line: int) -> Any:
-    """Return ruamel.yaml's tree of a text; raise FileError for bad syntax."""
-    from ruamel.yaml.constructor import DuplicateKeyError
+def _load_content(
+    text: str, path: Path, what: str, first_line: int, has_names: bool
+) -> tuple[Any, Mapping[Location, int]]:
+    """Return the content of a text, and the lines in it; raise FileError for bad syntax."""
     from ruamel.yaml.error import MarkedYAMLError, YAMLError
 
     if (directive := _DIRECTIVE.match(text)) is not None:
         sentence = "YAML directives, which begin with %, are not allowed here. Remove the line"
         raise FileError(sentence, path, directive[0].count("\n") + first_line)
     try:
-        return _parse_text(text) if len(text) <= KEPT_LENGTH else _parse_text.__wrapped__(text)
-    except DuplicateKeyError as error:
-        key = str(error.problem).split('"')[1] if '"' in str(error.problem) else "?"
-        line = error.problem_mark.line + first_line if error.problem_mark else None
-        raise FileError(f"duplicate key {quote(key)}. Remove one", path, line) from None
+        compose = _compose if len(text) <= KEPT_LENGTH else _compose.__wrapped__
+        reader = _NodeReader(has_names)
+        return reader.read(compose(text), (), 0), reader.lines
     except _RefusedError as error:
         line = error.line + first_line
         if isinstance(error.refusal, FileLimit):
@@ -142,7 +132,9 @@ def _load_tree(text: str, path: Path, what: str, first_line: int) -> Any:
         problem = _shorten(error.problem or error.context or "not YAML")
         sentence = f"not valid YAML ({problem}). Check indentation, brackets and colons"
         raise FileError(sentence, path, mark.line + first_line if mark else None) from None
-    except (YAMLError, ValueError, RecursionError, LookupError, AssertionError) as error:
+    except RecursionError:
+        raise YAML_DEPTH.make_error(what, path) from None
+    except (YAMLError, ValueError, LookupError, AssertionError) as error:
         if "integer string conversion" in str(error):  # Python reads no more than 4300 digits
             raise FileError("a number has thousands of digits. Write a shorter one", path) from None
         sentence = f"not valid YAML ({_shorten(error)}). Correct the syntax"
@@ -150,20 +142,20 @@ def _load_tree(text: str, path: Path, what: str, first_line: int) -> Any:
 
 
 @lru_cache(KEPT_TEXTS)
-def _parse_text(text: str) -> Any:
-    """Return ruamel.yaml's tree of a text, which nothing changes: it is only asked for lines."""
-    return make_round_trip_yaml().load(text)
+def _compose(text: str) -> Any:
+    """Return the nodes of a YAML text as ruamel.yaml composes them, None without any; each knows
+    its place in the text.
+    """
+    yaml = make_yaml()
+    yaml.composer.warn_double_anchors = False  # YAML allows an anchor again, for another value
+    return yaml.compose(text)
 
 
-def make_round_trip_yaml() -> Any:
-    """Return ruamel.yaml's round-trip reader and writer with the settings of this project."""
+def make_yaml() -> Any:
+    """Return ruamel.yaml's reader of YAML 1.2 in Python, for plain values."""
     from ruamel.yaml import YAML
 
-    yaml = YAML(typ="rt", pure=True)
-    yaml.Composer = _make_bounded_composer
-    yaml.preserve_quotes = True
-    yaml.width = 120
-    return yaml
+    return YAML(typ="safe", pure=True)
 
 
 def refuse_unknown_keys(
@@ -178,13 +170,6 @@ def refuse_unknown_keys(
             hint = suggest_names(key, allowed) or f". Allowed: {', '.join(sorted(allowed))}"
             sentence = f"unknown key {key!r}{_inside(location)}{hint}. Correct or remove it"
             raise file.error(sentence, (*location, key))
-
-
-def has_child(node: Any, step: str | int) -> bool:
-    """Return whether a mapping has the key, or a list the index, `step`."""
-    if isinstance(node, Mapping):
-        return step in node
-    return isinstance(node, list) and isinstance(step, int) and 0 <= step < len(node)
 
 
 def name_location(location: Location) -> str:
@@ -204,124 +189,108 @@ def _inside(location: Location) -> str:
     return f" in {name_location(location)!r}" if location else ""
 
 
-def _to_plain(node: Any, file: YamlFile, location: Location, has_names: bool) -> Any:
-    """Return `node` as plain Python values, see `YamlFile.content`; FileError for the first value
-    that is none, or, where the file `has_names`, a key or text that is not a name.
-    """
-    if isinstance(node, Mapping):
-        plain: dict[str, Any] = {}
-        for key, value in node.items():
-            place = (*location, key)
-            if not isinstance(key, str):
-                sentence = f"key {quote(key)}{_inside(location)} is not text. Put it in quotes"
-                raise file.error(sentence, place)
-            if has_names and (fault := find_fault_below(location, key)) is not None:
-                raise file.error(fault, place)
-            plain[str(key)] = _to_plain(value, file, place, has_names)
-        return plain
-    if isinstance(node, bool) or node is None:
-        return node
-    if isinstance(node, str):
-        if has_names and (fault := find_fault_below(location, node)) is not None:
-            raise file.error(fault, location)
-        return str(node)
-    if isinstance(node, int | float):
-        value = int(node) if isinstance(node, int) else float(node)
-        with suppress(OverflowError):
-            if math.isfinite(float(value)):
-                return value
-        shown = "too large" if isinstance(value, int) else value  # it may have thousands of digits
-        raise file.error(f"{name_location(location)!r} is {shown}. Write a finite number", location)
-    if isinstance(node, Sequence):
-        return [_to_plain(item, file, (*location, i), has_names) for i, item in enumerate(node)]
-    if isinstance(node, datetime.date):
-        return node.isoformat()
-    raise file.error(
-        f"{name_location(location)!r} has no value that loopcal reads. Put it in quotes", location
-    )
-
-
-# A composer of YAML that refuses tags, deep documents, those whose aliases stand for too much,
-# and keys that are lists or mappings.
-
-
 class _RefusedError(Exception):
     """A document beyond a limit, or another refusal as a sentence; the line is counted from 0."""
 
-    def __init__(self, refusal: FileLimit | str, line: int) -> None:
+    def __init__(self, refusal: FileLimit | Finding | str, line: int) -> None:
         super().__init__(refusal, line)
         self.refusal, self.line = refusal, line
 
 
-def _make_bounded_composer(loader: Any) -> Any:
-    """Return a composer of ruamel.yaml that counts values and levels, and checks keys.
+@dataclass
+class _NodeReader:
+    """Reads nodes as plain values, see `YamlFile.content`, and their lines.
 
-    It raises _RefusedError, also for a key that is no scalar, which ruamel.yaml cannot always
-    store, and MarkedYAMLError for an alias that stands for a value that contains it.
+    It refuses tags, deep documents, those whose aliases stand for too much, and keys that are no
+    text; where the file `has_names`, keys and texts that are no names.
     """
-    from ruamel.yaml.composer import Composer
-    from ruamel.yaml.error import MarkedYAMLError
-    from ruamel.yaml.events import AliasEvent
-    from ruamel.yaml.nodes import ScalarNode
 
-    class BoundedComposer(Composer):
-        """A composer that counts."""
+    has_names: bool
+    yaml: Any = field(default_factory=make_yaml)
+    lines: dict[Location, int] = field(default_factory=dict)
+    count: int = 0
+    sizes: dict[int, int] = field(default_factory=dict)  # values in a node that was read before
+    within: list[Any] = field(default_factory=list)
 
-        def __init__(self) -> None:
-            super().__init__(loader)
-            self._level = self._count = 0
-            self._parser: Any = None
-            self._sizes: dict[str, int] = {}
+    def read(self, node: Any, at: Location, line: int) -> Any:
+        """Return the value of a node at a location, whose key or item is in a line."""
+        if node is None:
+            return None
+        is_text, before = isinstance(node.value, str), self.count
+        self.count += 1
+        counts = self.count + self.sizes.get(id(node), 0), len(self.within) + 1
+        for limit, count in zip((YAML_NODES, YAML_DEPTH), counts, strict=True):
+            if count > limit.count:
+                raise _RefusedError(limit, line)
+        # a tag that the file states is not the one of the form of the value
+        form = (node.style is None, node.style is not None) if is_text else True
+        if node.tag != str(self.yaml.resolver.resolve(type(node), node.value, form)):
+            raise _RefusedError("YAML tags are not allowed here. Remove the tag", line)
+        if is_text:
+            return self._read_scalar(node, at, line)
+        if any(node is outer for outer in self.within):
+            problem = f"alias {node.anchor!r} stands for a value that contains the alias"
+            sentence = f"not valid YAML ({problem}). Check indentation, brackets and colons"
+            raise _RefusedError(sentence, line)
+        self.within.append(node)
+        if node.id == "mapping":
+            value: Any = self._read_keys(node.value, at)
+        else:  # an alias in a list has the line of the list
+            lines = [max(line, item.start_mark.line) for item in node.value]
+            self.lines |= {(*at, i): of_item for i, of_item in enumerate(lines)}
+            value = [self.read(item, (*at, i), lines[i]) for i, item in enumerate(node.value)]
+        self.within.pop()
+        self.sizes[id(node)] = self.count - before
+        return value
 
-        @property
-        def parser(self) -> Any:
-            """The parser of the loader, kept because it is asked for a dozen times in a value."""
-            if self._parser is None:
-                self._parser = super().parser
-            return self._parser
+    def _read_keys(self, nodes: Sequence[tuple[Any, Any]], at: Location) -> dict[str, Any]:
+        """Return the keys and values of a mapping, those that it merges behind its own."""
+        content: dict[str, Any] = {}
+        merged: list[dict[str, Any]] = []
+        for name, node in nodes:
+            line = name.start_mark.line
+            if not isinstance(name.value, str):
+                raise _RefusedError("a key is a list or a mapping. Write text there", line)
+            if name.tag.endswith(":merge"):
+                value = self.read(node, at, line)
+                merged += value if isinstance(value, list) else [value]
+                continue
+            key = self.read(name, at, line)
+            if not isinstance(key, str):
+                sentence = f"key {quote(key)}{_inside(at)} is not text. Put it in quotes"
+                raise _RefusedError(sentence, line)
+            if key in content:
+                raise _RefusedError(f"duplicate key {quote(key)}. Remove one", line)
+            self.lines[*at, key] = line
+            content[key] = self.read(node, (*at, key), line)
+        for other in merged:
+            content = {**other, **content}
+        return content
 
-        def compose_node(self, parent: Any, index: Any) -> Any:
-            """Return the next node; check that a key is a scalar."""
-            event = self.parser.peek_event()
-            node = self._compose_counted(parent, index, event)
-            is_key = parent is not None and index is None
-            if is_key and not isinstance(node, ScalarNode):
-                sentence = "a key is a list or a mapping. Write text there"
-                raise _RefusedError(sentence, event.start_mark.line)
-            return node
+    def _read_scalar(self, node: Any, at: Location, line: int) -> Any:
+        """Return the value of a scalar."""
+        from ruamel.yaml.error import YAMLError
 
-        def _compose_counted(self, parent: Any, index: Any, event: Any) -> Any:
-            """Return the next node, whose event is the next one; count its values."""
-            line = event.start_mark.line
-            if isinstance(event, AliasEvent):
-                if event.anchor in self.anchors and event.anchor not in self._sizes:
-                    problem = f"alias {event.anchor!r} stands for a value that contains the alias"
-                    raise MarkedYAMLError(problem=problem, problem_mark=event.start_mark)
-                self._add(self._sizes.get(event.anchor, 1), event)
-                return super().compose_node(parent, index)
-            if event.tag is not None:
-                raise _RefusedError("YAML tags are not allowed here. Remove the tag", line)
-            before = self._count
-            self._add(1, event)
-            self._level += 1
-            if self._level > YAML_DEPTH.count:
-                raise _RefusedError(YAML_DEPTH, line)
-            # YAML allows an anchor again, for another value; ruamel.yaml warns where it is known
-            self.anchors.pop(event.anchor, None)
-            self._sizes.pop(event.anchor, None)
-            node = super().compose_node(parent, index)
-            self._level -= 1
-            if event.anchor is not None:
-                self._sizes[event.anchor] = self._count - before
-            return node
-
-        def _add(self, values: int, event: Any) -> None:
-            """Count values; raise _RefusedError where they are too many."""
-            self._count += values
-            if self._count > YAML_NODES.count:
-                raise _RefusedError(YAML_NODES, event.start_mark.line)
-
-    return BoundedComposer()
+        value: Any = ...
+        with suppress(YAMLError):  # such as of a single =
+            value = self.yaml.constructor.construct_object(node)
+        if isinstance(value, datetime.date):
+            return value.isoformat()
+        if isinstance(value, str):
+            if self.has_names and (fault := find_fault_below(at, value)) is not None:
+                raise _RefusedError(fault, line)
+            return value
+        if value is None or isinstance(value, bool):
+            return value
+        if isinstance(value, int | float):
+            with suppress(OverflowError):
+                if math.isfinite(float(value)):
+                    return value
+            shown = "too large" if isinstance(value, int) else value  # perhaps thousands of digits
+            sentence = f"{name_location(at)!r} is {shown}. Write a finite number"
+            raise _RefusedError(sentence, line)
+        sentence = f"{name_location(at)!r} has no value that loopcal reads. Put it in quotes"
+        raise _RefusedError(sentence, line)
 
 
 # Text of YAML: names in quotes where they need them, and one key added to or removed from a
@@ -426,7 +395,7 @@ def _list_additions(file: YamlFile, entry: str, added: dict[str, Any]) -> Iterat
     end = "\r\n" if "\r\n" in text else "\n"
     whole = text if text.endswith("\n") else text + end
     yield whole + entry.replace("\n", end)
-    root = make_round_trip_yaml().compose(text)
+    root = make_yaml().compose(text)
     start, stop = root.start_mark.index, root.end_mark.index
     if root.flow_style:
         inside = _format_inside(added)
@@ -442,7 +411,7 @@ def _list_additions(file: YamlFile, entry: str, added: dict[str, Any]) -> Iterat
 
 def _list_removals(text: str, key: str) -> Iterator[str]:
     """Yield texts without a key and its value."""
-    root = make_round_trip_yaml().compose(text)
+    root = make_yaml().compose(text)
     for name, value in root.value:
         if name.value != key:
             continue

@@ -155,7 +155,7 @@ def read_result(path: Path) -> dict[str, Any]:
     text, plain = json.dumps(content, ensure_ascii=False), content
     if _SURROGATE.search(text):
         plain = json.loads(_SURROGATE.sub("?", text))
-    file = YamlFile(path, "", {}, plain)
+    file = YamlFile(path, "", plain)
     stated = read_record(file, plain, get_record(), None, word=report_damage)
     if problem := _find_contradiction(stated.expected_error):
         raise report_damage(path, problem)
