@@ -17,8 +17,7 @@ from loopcal.apply.calibration import calibrate
 from loopcal.apply.calibration_options import CalibrationOptions
 from loopcal.apply.compensation import compensate
 from loopcal.geometry import exp_so3, make_pose
-from loopcal.io.data.measurement_file import load_measurements
-from loopcal.io.data.measurement_writer import save_measurements
+from loopcal.io.data.measurement_file import load_measurements, save_measurements
 from loopcal.io.robot.robot_file import load_robot
 from loopcal.io.runs.result_files import format_compensation
 from loopcal.measure.instrument import Gaussian, Instrument, Sensor

@@ -28,9 +28,9 @@ from types import FrameType
 from typing import Any
 
 from loopcal.cli.entry_point import main
-from loopcal.io.core import outputs, replacement, text_file
+from loopcal.io.core import outputs, text_file
 
-MODULES = (outputs, replacement, text_file, shutil)
+MODULES = (outputs, text_file, shutil)
 TRACED = frozenset(str(module.__file__) for module in MODULES)
 FIRST = ("write_result_folder", "restore_files", "replace_file")
 """The functions that write; the first one that is called begins to write."""

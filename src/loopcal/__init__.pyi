@@ -96,7 +96,7 @@ from .findings import Finding as Finding
 from .findings import Quantity as Quantity
 from .findings import Severity as Severity
 from .io.data.measurement_file import load_measurements as load_measurements
-from .io.data.measurement_writer import save_measurements as save_measurements
+from .io.data.measurement_file import save_measurements as save_measurements
 from .io.formats import register_format as register_format
 from .io.formats.program_format import Exported as Exported
 from .io.formats.program_format import Format as Format

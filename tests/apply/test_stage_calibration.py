@@ -14,8 +14,7 @@ from scipy.stats import chi2
 from loopcal.errors import DataError
 from loopcal.estimate.identification import identify
 from loopcal.estimate.penalties import LeastSquares
-from loopcal.io.data.measurement_file import load_measurements
-from loopcal.io.data.measurement_writer import save_measurements
+from loopcal.io.data.measurement_file import load_measurements, save_measurements
 from loopcal.measure.instrument import Gaussian, Instrument, Sensor
 from loopcal.measure.kinds.distance import Separation
 from loopcal.measure.kinds.joints import JointSensor

@@ -13,8 +13,7 @@ from loopcal.apply.verdict import Verdict
 from loopcal.errors import DataError, FileError
 from loopcal.estimate.identification import identify
 from loopcal.estimate.options import FitOptions
-from loopcal.io.data.measurement_file import load_measurements
-from loopcal.io.data.measurement_writer import save_measurements
+from loopcal.io.data.measurement_file import load_measurements, save_measurements
 from loopcal.io.robot.robot_file import load_robot
 from loopcal.measure.instrument import Gaussian, Instrument, Sensor
 from loopcal.measure.kinds.poses import Component

@@ -11,7 +11,7 @@ from PIL import Image
 
 import loopcal as lc
 from loopcal.geometry import exp_so3, make_pose
-from loopcal.io.board import choose_board, format_board, read_board
+from loopcal.io.pictures import choose_board, format_board, read_board
 from loopcal.measure.kinds.image import Image as ImageKind
 from tests.cli.page_commands import run_page
 from tests.io.boards import render

@@ -4,7 +4,7 @@
 import cv2
 import numpy as np
 
-from loopcal.io.board import Board
+from loopcal.io.pictures import Board
 
 
 def make_charuco(board: Board) -> cv2.aruco.CharucoBoard:

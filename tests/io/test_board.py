@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from loopcal.errors import DataError, FileError
-from loopcal.io.board import (
+from loopcal.io.pictures import (
     PAPERS,
     Board,
     Shape,

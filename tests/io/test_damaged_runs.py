@@ -22,8 +22,7 @@ from loopcal.cli.entry_point import main
 from loopcal.errors import FileError, LoopcalError
 from loopcal.estimate.posterior import DISCREPANCY_PREFIX
 from loopcal.estimate.smooth_errors import describe_smooth_errors
-from loopcal.io.runs.run_folder import Run
-from loopcal.io.runs.run_result import FITTED, FORMS, find_problem, read_result
+from loopcal.io.runs.run_folder import FITTED, FORMS, Run, find_problem, read_result
 from loopcal.report.calibration_view import view_budget
 from loopcal.results.storage import store_arrays
 from loopcal.units import find_unit

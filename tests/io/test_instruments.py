@@ -10,7 +10,7 @@ import pytest
 import loopcal as lc
 from loopcal.cli.entry_point import main
 from loopcal.errors import DataError, FileError
-from loopcal.io.data.measurement_writer import format_measurements
+from loopcal.io.data.measurement_file import format_measurements
 from loopcal.measure.observations import check_instruments
 
 FACTS = {

@@ -8,8 +8,11 @@ import numpy as np
 import pytest
 
 from loopcal.errors import LoopcalError
-from loopcal.io.data.measurement_file import list_measurement_files, load_measurements
-from loopcal.io.data.measurement_writer import save_measurements
+from loopcal.io.data.measurement_file import (
+    list_measurement_files,
+    load_measurements,
+    save_measurements,
+)
 from loopcal.measure.instrument import Gaussian, Instrument, Sensor
 from loopcal.measure.kinds.directions import Inclination
 from loopcal.measure.kinds.poses import Component

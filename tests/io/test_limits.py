@@ -20,7 +20,7 @@ from loopcal.io.core.csv_table import read_table
 from loopcal.io.core.text_file import read_bytes, read_json, read_text, sha256
 from loopcal.io.core.yaml_file import read_yaml
 from loopcal.io.robot.robot_file import find_robot_file, load_robot
-from loopcal.io.runs.run_result import read_arrays
+from loopcal.io.runs.run_folder import read_arrays
 
 FIVE_BAR = find_robot_file("five-bar").read_text("utf-8")
 SMALL = limits.FileLimit("size", 0.01, "MB", "a test", "shorten it")

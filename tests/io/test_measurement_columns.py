@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from loopcal.errors import DataError, LoopcalError
-from loopcal.io.data.measurement_file import load_measurements
-from loopcal.io.data.measurement_writer import format_data_sheet, save_measurements
+from loopcal.io.data.measurement_file import format_data_sheet, load_measurements, save_measurements
 from loopcal.measure.instrument import Gaussian, Instrument, Sensor
 from loopcal.measure.kinds.poses import Component
 from loopcal.measure.kinds.position import Position

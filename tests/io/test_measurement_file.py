@@ -6,8 +6,12 @@ import pytest
 
 from loopcal.errors import DataError, LoopcalError
 from loopcal.io.data.kind_settings import list_kind_settings
-from loopcal.io.data.measurement_file import load_measurements, load_poses
-from loopcal.io.data.measurement_writer import format_template, save_measurements
+from loopcal.io.data.measurement_file import (
+    format_template,
+    load_measurements,
+    load_poses,
+    save_measurements,
+)
 from loopcal.measure.instrument import Gaussian, Instrument, Sensor
 from loopcal.measure.kinds import KINDS
 from loopcal.measure.kinds.poses import Component, Pose

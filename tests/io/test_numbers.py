@@ -18,7 +18,7 @@ from loopcal.io.core.csv_table import (
     parse_finite,
     read_table,
 )
-from loopcal.io.data.measurement_writer import save_measurements
+from loopcal.io.data.measurement_file import save_measurements
 from loopcal.io.robot.robot_file import load_robot, save_robot
 from loopcal.measure.simulation import sample_truth
 from loopcal.units import Dimension, parse_number, parse_quantity

@@ -10,10 +10,10 @@ from PIL import Image
 
 from loopcal.errors import DataError, FileError
 from loopcal.geometry import exp_so3, make_pose
-from loopcal.io.board import choose_board
 from loopcal.io.pictures import (
     Picture,
     PictureTask,
+    choose_board,
     compare_pictures,
     examine_picture,
     format_contact_sheet,

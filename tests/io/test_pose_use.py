@@ -10,8 +10,12 @@ import pytest
 import loopcal as lc
 from loopcal.apply.calibration_options import split_data
 from loopcal.errors import DataError, FileError
-from loopcal.io.data.measurement_file import list_unfilled_files, load_measurements, read_tables
-from loopcal.io.data.measurement_writer import save_measurements
+from loopcal.io.data.measurement_file import (
+    list_unfilled_files,
+    load_measurements,
+    read_tables,
+    save_measurements,
+)
 from loopcal.measure.instrument import Gaussian, Instrument, Sensor
 from loopcal.measure.kinds.position import Position
 from loopcal.measure.measurements import Measurements

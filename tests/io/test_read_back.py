@@ -18,8 +18,7 @@ from hypothesis import strategies as st
 
 from loopcal.cli.entry_point import main
 from loopcal.errors import DataError, FileError
-from loopcal.io.data.measurement_file import load_measurements
-from loopcal.io.data.measurement_writer import save_measurements
+from loopcal.io.data.measurement_file import load_measurements, save_measurements
 from loopcal.io.robot.robot_file import find_robot_file, load_robot, save_robot
 from loopcal.measure.kinds.position import Position
 from loopcal.measure.measurements import Measurements

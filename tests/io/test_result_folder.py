@@ -8,14 +8,14 @@ from pathlib import Path
 import pytest
 
 from loopcal.errors import FileError
-from loopcal.io.core import replacement
+from loopcal.io.core import text_file
 from loopcal.io.core.outputs import (
     FolderKind,
     describe_leftover,
     refuse_folder,
     write_result_folder,
 )
-from loopcal.io.core.replacement import NEW, OLD, list_leftovers
+from loopcal.io.core.text_file import NEW, OLD, list_leftovers
 
 RUN = FolderKind("run", "result.json", ("made_by", "fit"), ("arrays.npz", "robot.yaml"))
 STUDY = FolderKind("study", "result.json", ("made_by", "paper"), ("page.md", "tables/*.csv"))
@@ -115,14 +115,14 @@ def test_folder_with_another_document_is_not_replaced(tmp_path, text) -> None:
 
 def test_folder_that_changes_during_the_exchange_is_kept(tmp_path, monkeypatch) -> None:
     write(tmp_path / "a")
-    exchange = replacement._exchange
+    exchange = text_file._exchange
 
     def add_a_file_first(first: Path, second: Path) -> bool:
         if first.name.startswith(".loopcal-new") and not (first / "mine").exists():
             (second / "mine").touch()
         return exchange(first, second)
 
-    monkeypatch.setattr(replacement, "_exchange", add_a_file_first)
+    monkeypatch.setattr(text_file, "_exchange", add_a_file_first)
     with pytest.raises(FileError, match="a: this folder also contains mine"):
         write(tmp_path / "a", force=True, text="new")
     assert sorted(read_all(tmp_path / "a")) == ["arrays.npz", "mine", "result.json", "robot.yaml"]
@@ -146,7 +146,7 @@ def test_symbolic_link_stays_a_link(tmp_path) -> None:
 
 def test_folder_whose_name_is_taken_between_two_renames_is_written(tmp_path, monkeypatch) -> None:
     """Another command takes the name while the old folder is set aside."""
-    take, other = replacement._take_free_name, tmp_path / "b"
+    take, other = text_file._take_free_name, tmp_path / "b"
     write(other, text="other")
 
     def take_later(temporary: Path, target: Path) -> bool:
@@ -154,7 +154,7 @@ def test_folder_whose_name_is_taken_between_two_renames_is_written(tmp_path, mon
             other.rename(target)
         return take(temporary, target)
 
-    monkeypatch.setattr(replacement, "_take_free_name", take_later)
+    monkeypatch.setattr(text_file, "_take_free_name", take_later)
     write(tmp_path / "a")
     for text in ("new", "newer"):  # the second one removes the folder that was set aside
         write(tmp_path / "a", force=True, text=text)
@@ -166,7 +166,7 @@ def leave(path: Path, state: str, kind: FolderKind = RUN) -> Path:
     """Make what a command leaves that was killed: a complete folder with a temporary name."""
     place = path.with_name("elsewhere")
     write(place, kind)
-    return place.rename(replacement._name_beside(path, state))
+    return place.rename(text_file._name_beside(path, state))
 
 
 def test_folder_set_aside_is_named_by_readers_and_returned_by_writers(tmp_path) -> None:
@@ -190,7 +190,7 @@ def test_leftovers_of_loopcal_are_removed_and_others_stay(tmp_path) -> None:
     (foreign[1] / "robot.yaml").write_text("changed")
     others = tmp_path / ".loopcal-mine"
     others.mkdir()
-    link = replacement._name_beside(path, NEW)
+    link = text_file._name_beside(path, NEW)
     link.symlink_to(others)
     beside = leave(tmp_path / "b", NEW)
     refuse_folder(path, RUN, force=True)
@@ -201,7 +201,7 @@ def test_leftovers_of_loopcal_are_removed_and_others_stay(tmp_path) -> None:
 
 def test_folder_that_is_being_written_is_no_leftover(tmp_path) -> None:
     path = tmp_path / "a"
-    with replacement.create_temporary(path, is_folder=True) as temporary:
+    with text_file.create_temporary(path, is_folder=True) as temporary:
         refuse_folder(path, RUN, force=True)
         assert list_leftovers(path) == [temporary]
     assert list_leftovers(path) == []

@@ -10,12 +10,13 @@ import pytest
 from loopcal.errors import FileError
 from loopcal.io.core.text_file import to_json
 from loopcal.io.runs.run_folder import (
+    FORMS,
+    GROUPS,
     MADE_BY,
     collect_provenance,
     read_run_folder,
     write_run_folder,
 )
-from loopcal.io.runs.run_result import FORMS, GROUPS
 
 RESULT = {
     "format": 2,

@@ -13,8 +13,7 @@ import loopcal as lc
 from loopcal.diagnose.adjusted_uncertainty import adjust_uncertainty
 from loopcal.errors import FileError
 from loopcal.estimate.identification import identify
-from loopcal.io.data.measurement_file import load_instrument, load_measurements
-from loopcal.io.data.measurement_writer import save_measurements
+from loopcal.io.data.measurement_file import load_instrument, load_measurements, save_measurements
 from loopcal.measure.simulation import sample_truth, simulate_trials
 from loopcal.mechanism.workspace import sample_workspace
 from tests.diagnose.correlated_data import LENGTH, ROBOTS, draw_errors, measure

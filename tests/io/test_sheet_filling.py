@@ -24,11 +24,9 @@ from loopcal.cli.entry_point import main
 from loopcal.diagnose.conventions.convention_check import check_conventions
 from loopcal.diagnose.point_names import examine_points
 from loopcal.errors import DataError, FileError
-from loopcal.io.data.measurement_file import load_measurements
-from loopcal.io.data.measurement_writer import format_data_sheet
-from loopcal.io.exports.conversion import save_converted
+from loopcal.io.data.measurement_file import format_data_sheet, load_measurements
+from loopcal.io.exports.conversion import fill_sheet, save_converted
 from loopcal.io.exports.profile import find_profile_file, read_profile, with_local_settings
-from loopcal.io.exports.sheet_filling import fill_sheet
 from loopcal.measure.instrument import Gaussian, Instrument, Sensor
 from loopcal.measure.kinds.position import Position
 

@@ -26,7 +26,7 @@ from loopcal.findings import Finding, report_finding
 from loopcal.findings.wording import name_count
 from loopcal.io.core.outputs import FolderKind, refuse_folder, write_result_folder
 from loopcal.io.core.text_file import as_path
-from loopcal.io.data.measurement_writer import format_measurements
+from loopcal.io.data.measurement_file import format_measurements
 from loopcal.io.robot.robot_file import format_robot
 from loopcal.io.runs.run_folder import build_document, refuse_run_folder, save_run
 from loopcal.results.tables import Block

@@ -12,8 +12,7 @@ import loopcal as lc
 from loopcal import forward, inverse
 from loopcal.diagnose.identifiable_parameters import identifiability
 from loopcal.errors import FileError
-from loopcal.io.data.measurement_file import load_measurements
-from loopcal.io.data.measurement_writer import save_measurements
+from loopcal.io.data.measurement_file import load_measurements, save_measurements
 from loopcal.io.formats import hangprinter
 from loopcal.io.formats.import_export import build_imported_robot
 from loopcal.io.formats.program_format import ImportOptions

@@ -13,8 +13,7 @@ from loopcal.diagnose.fit_examination import compute_reading_errors
 from loopcal.errors import FileError, MechanismError
 from loopcal.estimate.identification import identify
 from loopcal.estimate.penalties import MAP
-from loopcal.io.data.measurement_file import load_measurements
-from loopcal.io.data.measurement_writer import save_measurements
+from loopcal.io.data.measurement_file import load_measurements, save_measurements
 from loopcal.io.robot.robot_file import SHIPPED_ROBOTS, load_robot
 from loopcal.measure.instrument import Gaussian, Instrument, Sensor
 from loopcal.measure.kinds.poses import Pose

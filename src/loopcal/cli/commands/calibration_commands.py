@@ -88,8 +88,12 @@ def calibrate(
     """
     from loopcal.io.data.measurement_file import list_measurement_files
     from loopcal.io.robot.robot_file import find_robot_file
-    from loopcal.io.runs.run_folder import build_document, name_robot_file, refuse_run_folder
-    from loopcal.io.runs.run_result import RESULT
+    from loopcal.io.runs.run_folder import (
+        RESULT,
+        build_document,
+        name_robot_file,
+        refuse_run_folder,
+    )
     from loopcal.report.calibration_view import view_calibration
 
     inputs = {"robot": find_robot_file(robot), **list_measurement_files(data)}

@@ -116,9 +116,8 @@ def fill(
     """
     from loopcal.diagnose.conventions.convention_check import check_conventions
     from loopcal.diagnose.point_names import examine_points
-    from loopcal.io.exports.conversion import save_converted
+    from loopcal.io.exports.conversion import fill_sheet, save_converted
     from loopcal.io.exports.profile import find_profile_file, read_profile, with_local_settings
-    from loopcal.io.exports.sheet_filling import fill_sheet
 
     path = find_profile_file(profile)
     machine = opt.open_robot(robot, (output,), (sheet, *exports, path), force)

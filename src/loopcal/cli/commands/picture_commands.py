@@ -41,7 +41,9 @@ def board(
       loopcal board -o board.yaml --columns 12 --rows 8 --square 15mm --paper letter
     """
     from loopcal.errors import DataError
-    from loopcal.io.board import (
+    from loopcal.io.core.outputs import refuse_outputs, restore_on_failure
+    from loopcal.io.core.text_file import write_bytes, write_text
+    from loopcal.io.pictures import (
         PAPERS,
         choose_board,
         draw_board,
@@ -49,8 +51,6 @@ def board(
         format_pdf,
         format_svg,
     )
-    from loopcal.io.core.outputs import refuse_outputs, restore_on_failure
-    from loopcal.io.core.text_file import write_bytes, write_text
 
     if output.suffix not in (".yaml", ".yml"):
         raise DataError(f"{output} describes the board. Use a name that ends in .yaml")
@@ -128,10 +128,10 @@ def photos(
     from loopcal.errors import DataError
     from loopcal.findings import report_finding
     from loopcal.io import pictures as of
-    from loopcal.io.board import load_dictionary, read_board
     from loopcal.io.core.csv_table import refuse_settings_beside
     from loopcal.io.core.outputs import refuse_outputs, restore_on_failure
     from loopcal.io.core.text_file import write_text
+    from loopcal.io.pictures import load_dictionary, read_board
     from loopcal.studies.executors import Processes, Serial
 
     if output.suffix != ".csv":

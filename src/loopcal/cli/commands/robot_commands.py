@@ -59,7 +59,7 @@ def new(
     from loopcal.io.core.outputs import refuse_outputs, restore_on_failure
     from loopcal.io.core.text_file import to_json, write_text
     from loopcal.io.core.yaml_file import parse_yaml
-    from loopcal.io.data.measurement_writer import format_template
+    from loopcal.io.data.measurement_file import format_template
     from loopcal.io.robot.robot_file import EDITOR_SCHEMA, build_robot, format_new_robot
     from loopcal.io.runs.certificate import read_template
 

@@ -21,22 +21,20 @@ from typing import Any, NamedTuple
 from loopcal.errors import FileError
 from loopcal.findings import report_finding
 from loopcal.io.core.limits import TABLE_SIZE
-from loopcal.io.core.replacement import (
-    create_temporary,
-    list_leftovers,
-    place_folder,
-    remove_leftovers,
-    restore_files,
-    watch_folder,
-)
 from loopcal.io.core.text_file import (
     convert_document,
+    create_temporary,
     iterate_content,
+    list_leftovers,
+    place_folder,
     read_json,
+    remove_leftovers,
     report_write_errors,
     resolve_links,
     resolve_target,
+    restore_files,
     sha256,
+    watch_folder,
 )
 
 FILES = "files"

@@ -20,7 +20,7 @@ from loopcal.findings import Finding, report_finding
 from loopcal.io.core.csv_table import format_scaled
 from loopcal.io.core.text_file import write_text
 from loopcal.io.core.yaml_file import parse_yaml
-from loopcal.io.data.measurement_writer import save_measurements
+from loopcal.io.data.measurement_file import save_measurements
 from loopcal.io.formats import FORMATS
 from loopcal.io.formats.program_format import Exported, ExportSource, Format, Imported
 from loopcal.io.robot.robot_file import build_robot, load_robot

@@ -26,7 +26,7 @@ from loopcal.errors import FileError
 from loopcal.io.core.csv_table import format_row, parse_exact
 from loopcal.io.core.outputs import FolderKind
 from loopcal.io.data.columns import COMMANDED, FIT, HELD_OUT, USE_COLUMN
-from loopcal.io.data.measurement_writer import format_data_sheet, format_measurements
+from loopcal.io.data.measurement_file import format_data_sheet, format_measurements
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import POSITION, get_dimension
 from loopcal.units import Dimension, find_unit

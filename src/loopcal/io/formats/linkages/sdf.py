@@ -22,20 +22,18 @@ from loopcal.findings import report_finding
 from loopcal.io.core.text_file import read_text
 from loopcal.io.formats.linkages.linkage_format import make_format
 from loopcal.io.formats.linkages.tree import (
+    SAME,
     Constraint,
+    Edit,
+    Element,
     LinkTree,
     TreeJoint,
+    apply_edits,
     build_tree,
     derive_end,
     draw_links,
-    make_end,
-)
-from loopcal.io.formats.linkages.xml_tree import (
-    SAME,
-    Edit,
-    Element,
-    apply_edits,
     format_numbers,
+    make_end,
     measure_rounding,
     parse_xml,
 )

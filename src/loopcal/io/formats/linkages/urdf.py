@@ -24,11 +24,15 @@ from loopcal.io.core.limits import find_fault
 from loopcal.io.core.text_file import read_text
 from loopcal.io.formats.linkages.linkage_format import make_format
 from loopcal.io.formats.linkages.sdf import list_embedded_constraints, write_pose
-from loopcal.io.formats.linkages.tree import Constraint, LinkTree, TreeJoint, build_tree, make_end
-from loopcal.io.formats.linkages.xml_tree import (
+from loopcal.io.formats.linkages.tree import (
+    Constraint,
     Edit,
     Element,
+    LinkTree,
+    TreeJoint,
     apply_edits,
+    build_tree,
+    make_end,
     measure_rounding,
     parse_xml,
 )
