@@ -83,7 +83,10 @@ def list_files(root: Path) -> dict[str, list[Path]]:
         "pages": list_pages(root),
         "catalog": sorted(catalog.iterdir()),
         "commands": commands,
-        "other texts": [p for p in code if p not in commands and p.parent != catalog],
+        "other texts": [
+            *(p for p in code if p not in commands and p.parent != catalog),
+            *sorted((source / "report").glob("*.toml")),
+        ],
     }
 
 
@@ -128,7 +131,7 @@ def list_templates(path: Path) -> Iterator[tuple[int, str]]:
     for template in _list_values(tomllib.loads(text)):
         start = text.find(template.strip()[:40].split("\n")[0])
         worded = " ".join(template.split())
-        if path.parent.name == "catalog":
+        if path.parent.name in ("catalog", "report"):
             variants = {
                 fill_branches(worded, shared, branch) for branch in range(_branches(worded))
             }

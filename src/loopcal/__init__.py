@@ -14,7 +14,7 @@ from loopcal.version import __version__ as __version__
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
 name_presenters(
-    page=["loopcal.report.pages"],
+    page=["loopcal.report.calibration_view", "loopcal.report.validation_view"],
     figure=[
         f"loopcal.report.figures.{module}"
         for module in ("fit_figures", "plan_figures", "result_figures", "robot_figure")

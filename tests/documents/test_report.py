@@ -24,7 +24,8 @@ from loopcal.report.document.calibration_document import build_calibration_docum
 from loopcal.report.document.elements import Document, Picture, render_html
 from loopcal.report.document.figures import thin_rows
 from loopcal.report.scene.scene import load_script
-from loopcal.report.validation_view import READING_NOISE, view_errors
+from loopcal.report.validation_view import view_errors
+from loopcal.report.words import say
 from loopcal.results.tables import Table
 
 pytestmark = pytest.mark.slow
@@ -300,7 +301,8 @@ def test_budget_of_a_platform_that_does_not_rotate_states_no_orientation(root) -
 
 @pytest.mark.usefixtures("do_not_draw")
 def test_noise_floor_of_uncertain_readings_is_called_a_lower_bound(page, root) -> None:
-    assert READING_NOISE not in page.read_text("utf-8")  # the readings of this example are exact
+    lower_bound = say("errors.reading-noise")
+    assert lower_bound not in page.read_text("utf-8")  # the readings of this example are exact
     machine = lc.load_robot("cable-4")
     kind = lc.Position(places=np.zeros((1, 3)))
     instrument = lc.Instrument((lc.Sensor(kind, lc.Gaussian(np.full(3, 1e-3))),))
@@ -308,8 +310,8 @@ def test_noise_floor_of_uncertain_readings_is_called_a_lower_bound(page, root) -
     data = lc.simulate(machine, poses, instrument, seed=3)
     report = lc.calibrate(machine, data, lc.CalibrationOptions(hold_out=0.4))
     assert report.reading_errors is not None
-    assert READING_NOISE in str(build(load_record(report), "errors").sections[0].elements[0])
-    assert READING_NOISE in report._repr_html_()
+    assert lower_bound in str(build(load_record(report), "errors").sections[0].elements[0])
+    assert lower_bound in report._repr_html_()
 
 
 def test_a_decorated_function_adds_a_figure_to_its_section(run, monkeypatch) -> None:

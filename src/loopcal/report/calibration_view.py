@@ -15,13 +15,10 @@ from loopcal.diagnose.row_errors import METRICS, SUMMARY
 from loopcal.estimate.result import LAST_DIGITS, Identification
 from loopcal.findings import Finding, Severity, report_finding
 from loopcal.findings.wording import add_advice, count_decimals, list_names
-from loopcal.report.validation_view import (
-    READING_NOISE,
-    describe_improvements,
-    view_error_statistics,
-    view_errors,
-)
+from loopcal.report.validation_view import describe_improvements, view_error_statistics, view_errors
+from loopcal.report.words import say
 from loopcal.results.description import Field
+from loopcal.results.presenters import register
 from loopcal.results.tables import (
     ABSENT,
     Block,
@@ -97,6 +94,7 @@ def build_height_map(heights: HeightErrors) -> Table | str:
     return make_table(caption, ("pose", *numbers, "used"), rows)
 
 
+@register("page", "loopcal.apply.height_errors:HeightErrors")
 def view_heights(heights: HeightErrors | None, verbose: bool = False) -> list[Block]:
     """Return the tables of a page: each of few points, and rms and largest error of many."""
     if heights is None:
@@ -119,6 +117,7 @@ def no_hint(_: Finding) -> None:
     """Return no advice."""
 
 
+@register("page", "loopcal.apply.calibration_report:CalibrationReport")
 def view_calibration(
     report: CalibrationReport, verbose: bool = False, hint: Hint = no_hint
 ) -> list[Block]:
@@ -141,7 +140,7 @@ def view_calibration(
         blocks += view_errors(report.fitted_errors, "fitted (optimistic)")
     errors = report.validation or report.fitted_errors
     if errors is not None and report.reading_errors is not None:
-        blocks.append(READING_NOISE)
+        blocks.append(say("errors.reading-noise"))
     blocks += view_heights(report.height_errors, verbose)
     selected = report.findings if verbose else report.top_findings
     blocks += ["", *format_list([(f.severity.value, add_advice(f, hint(f))) for f in selected])]
@@ -299,6 +298,12 @@ def view_fit(fit: Identification) -> list[Block]:
     return [*_view_parameters(fit, caption, rows), iteration]
 
 
+@register("page", Identification)
+def _view_fit_and_findings(fit: Identification) -> list[Block]:
+    """Return the page of a fit, and its findings."""
+    return [*view_fit(fit), *(f"{f.severity.value}: {f}" for f in fit.findings)]
+
+
 def _describe_iteration(fit: Identification) -> str:
     """Return how a fit ended, and its residuals in one number."""
     status = fit.status.name.lower().replace("_", " ")
@@ -307,22 +312,6 @@ def _describe_iteration(fit: Identification) -> str:
 
 
 # The uncertainty budget of a calibration: `ErrorBudget.to_dict()`, or `expected_error` of a run.
-
-MEANING = (
-    "Standard uncertainties (k = 1): root mean square over {poses} {over}, tool point, and the "
-    "parameter known worst relative to its expected spread. Their squares add up. Setup "
-    "parameters: what "
-    "not knowing them adds to an instrument with a known setup. Type A: evaluated by statistics. "
-    "Type B: by other means. Halved: what remains with half the sigma of this source, all weights "
-    "changed."
-)
-
-
-GUM_MEANING = (
-    "Budget of the {kind} by source (JCGM 100): value as stated, u = value / divisor times what "
-    "residuals say of all stated sigmas, sensitivity = contribution / u. Degrees of freedom of the "
-    "sum by Welch and Satterthwaite"
-)
 
 
 def view_budget(
@@ -376,7 +365,7 @@ def build_budget_table(budget: Mapping[str, Any], robot: Mechanism) -> Table:
         for kind, unit in shown.items()
     ]
     over = "poses of the workspace" if budget["over"] == "workspace" else "measured poses"
-    caption = MEANING.format(poses=budget["poses"], over=over)
+    caption = say("budget.meaning", poses=budget["poses"], over=over)
     return make_table(caption, ("source", "type", Column("degrees of freedom"), *columns), rows)
 
 
@@ -406,7 +395,7 @@ def _build_gum_table(budget: Mapping[str, Any], robot: Mechanism, kind: str) -> 
     numbers = (Column(title) for title in ("divisor", "u", "sensitivity"))
     columns = ("source", "type", Column("value"), "distribution", *numbers)
     ends = (Column("contribution", unit.symbol), Column("degrees of freedom"))
-    return make_table(GUM_MEANING.format(kind=kind), (*columns, *ends), rows)
+    return make_table(say("budget.gum", kind=kind), (*columns, *ends), rows)
 
 
 def build_share_table(budget: Mapping[str, Any]) -> Table:
@@ -491,12 +480,13 @@ def view_compensation(result: Compensation) -> list[Block]:
     return blocks
 
 
-# Identifiability as people read it: what the data determine, then each parameter.
+@register("page", "loopcal.apply.compensation:Compensation")
+def _view_targets_and_findings(result: Compensation) -> list[Block]:
+    """Return the targets, and the findings of those that are not reached."""
+    return [str(result), *view_compensation(result)]
 
-SD_MEANING = (
-    "sd / tolerance: standard deviation with the tolerances as a prior; 1 means that the data add "
-    "nothing."
-)
+
+# Identifiability as people read it: what the data determine, then each parameter.
 
 MOST_COMBINATIONS, FEW_PARAMETERS = 8, 12
 """Combinations and suggestions that a page lists, and parameters that a summary lists one by one;
@@ -546,7 +536,7 @@ def view_identifiability(report: IdentifiabilityReport, verbose: bool = False) -
             rows.append((row.name, states.get(row.state) or others, f"{row.left:.2f}"))
         determined = word_column("determined", wraps=True)
         columns = ("name", determined, Column("sd / tolerance"))
-        blocks += [make_table("Parameters", columns, rows), SD_MEANING]
+        blocks += [make_table("Parameters", columns, rows), say("parameters.sd")]
     if verbose:
         values = [(n, meaning, format_number(x, 3)) for n, x, meaning in analysis.indices.rows()]
         meaning = word_column("meaning", wraps=True)

@@ -14,6 +14,8 @@ from loopcal.apply.validation import FEW_ROWS, ErrorChange, Validation
 from loopcal.diagnose.row_errors import METRICS, SUMMARY
 from loopcal.findings import Finding, Severity, sort_by_importance
 from loopcal.findings.wording import list_names
+from loopcal.report.words import say
+from loopcal.results.presenters import register
 from loopcal.results.tables import (
     ABSENT,
     ROUNDING,
@@ -42,18 +44,6 @@ if TYPE_CHECKING:
 CONFORMITY = "conformity."
 """Beginning of the codes of statements on limits, which follow the tables."""
 
-READING_NOISE = (
-    "The noise floor does not contain the noise of the actuator readings, so it is a lower bound."
-)
-"""Sentence for robots whose readings are uncertain."""
-
-COMMANDED = (
-    "These errors and the decisions on limits compare predicted with measured poses at equal "
-    "readings. Readings only correct commanded coordinates. The others still differ from the "
-    "geometry before calibration by {errors} (rms, without noise)."
-)
-"""Sentence for robots whose geometric errors also move what they cannot command."""
-
 NOTICEABLE = 0.01
 """Share of the error after calibration above which such a difference is stated."""
 
@@ -66,6 +56,7 @@ def list_findings(findings: Sequence[Finding]) -> list[str]:
     return format_list([(f.severity.value, str(f)) for f in findings])
 
 
+@register("page", Validation)
 def view_validation(
     validation: Validation, with_before: bool = True, verbose: bool = False
 ) -> list[Block]:
@@ -199,7 +190,7 @@ def describe_commanded(validation: Validation) -> str:
         unit, after = validation.units[quantity], validation.after.statistics(quantity).rms
         if math.isfinite(rms) and rms > NOTICEABLE * after:
             shown.append(f"{format_in(unit, rms, 3)} {unit.symbol} in {quantity}")
-    return COMMANDED.format(errors=" and ".join(shown)) if shown else ""
+    return say("errors.commanded", errors=" and ".join(shown)) if shown else ""
 
 
 def describe_improvements(validation: Validation) -> list[str]:
@@ -232,6 +223,7 @@ def _compare(change: ErrorChange) -> str:
     return "larger after calibration"
 
 
+@register("page", Repeatability)
 def view_repeatability(result: Repeatability, robot: Mechanism | None = None) -> list[Block]:
     """Return the page of pose accuracy and repeatability, in the units of a robot's file."""
     units = DISPLAY_UNITS if robot is None else robot.shown_units
@@ -263,14 +255,8 @@ def view_repeatability(result: Repeatability, robot: Mechanism | None = None) ->
 
 # Several calibrations side by side: findings, parameters, shifts, and errors at the same poses.
 
-SHIFTS = (
-    "Shifts from {first}, with all other parameters free to have changed as well. They follow "
-    "from the data alone. Tolerances also draw estimates to nominal. A shift is "
-    "significant (*) at 5 % for all parameters and runs together. A dash: undetermined by the "
-    "data of both runs, or not tested."
-)
 
-
+@register("page", "loopcal.apply.run_comparison:RunComparison")
 def view_comparison(comparison: RunComparison) -> list[Block]:
     """Return the page of a comparison."""
     names = ", ".join(run.name for run in comparison.runs)
@@ -331,7 +317,7 @@ def build_shifts(comparison: RunComparison) -> Table:
             cells.append(f"{round(shift / sd, 1) + 0.0:.1f}{'*' if is_significant else ' '}")
         rows.append((*cells, unit.symbol))
     of_pairs = (Column(title) for pair in comparison.pairs for title in (pair.second, "in sd"))
-    caption = SHIFTS.format(first=comparison.runs[0].name)
+    caption = say("comparison.shifts", first=comparison.runs[0].name)
     return make_table(caption, ("parameter", *of_pairs, "unit"), rows)
 
 
@@ -382,9 +368,6 @@ def tabulate_comparison(comparison: RunComparison) -> Table:
 
 # Regularization curves as tables.
 
-SCORE = (
-    "Held-out error: mean square of residuals over sigma at poses that were left out. 1 is noise."
-)
 WORDS = {"lam": ("Ridge", "lam"), "k": ("Truncated SVD", "k")}
 """Name of a curve -> the method in words, and its number."""
 
@@ -395,6 +378,7 @@ ROWS = 9
 """Values of a curve that the table contains beside those that rules choose."""
 
 
+@register("page", "loopcal.diagnose.cross_validation:RegularizationCurves")
 def view_regularization(curves: RegularizationCurves) -> list[Block]:
     """Return the page of regularization curves: what rules choose, then the curves."""
     left_out = (
@@ -404,17 +388,12 @@ def view_regularization(curves: RegularizationCurves) -> list[Block]:
     )
     page: list[Block] = [
         f"{curves.robot}: {curves.poses} poses, {curves.parameters} parameters; {left_out}.",
-        f"{SCORE} lam is (sigma per tolerance)^2: lam = 1 uses the tolerances as a prior.",
+        say("curves.score"),
     ]
     if curves.assumed:
-        page.append(
-            f"{curves.assumed} parameters have no expected spread. Assumed values scale them."
-        )
+        page.append(say("curves.assumed", assumed=curves.assumed))
     if curves.scheme == "folds":
-        page.append(
-            "Frames, targets and surfaces of held-out poses are estimated from these poses, which "
-            "lowers all values alike."
-        )
+        page.append(say("curves.folds"))
     rows = [("given robot", "", "", *_format_score(*curves.nominal))]
     for curve in (curves.ridge, curves.truncation):
         method, number = WORDS[curve.name]
@@ -458,6 +437,7 @@ def _format_score(score: float, error: float) -> tuple[str, str]:
 # Bootstrap, sampled posterior and joint regions.
 
 
+@register("page", "loopcal.diagnose.bootstrap:Bootstrap")
 def view_bootstrap(result: Bootstrap, intervals: Intervals | None = None) -> list[Block]:
     """Return the page of a bootstrap: what was drawn, findings, intervals."""
     blocks, count = result.blocks, len(result.draws)
@@ -465,6 +445,7 @@ def view_bootstrap(result: Bootstrap, intervals: Intervals | None = None) -> lis
     return _view_draws(f"bootstrap, {drawn}", result, intervals or result.intervals())
 
 
+@register("page", "loopcal.diagnose.posterior_sample:PosteriorSample")
 def view_posterior(sample: PosteriorSample, intervals: Intervals | None = None) -> list[Block]:
     """Return the page of a sampled posterior: effective size, findings, intervals."""
     drawn = f"{len(sample.draws)} weighted draws worth {sample.effective_size:.0f}"

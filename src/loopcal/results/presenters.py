@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 Presenter = Callable[..., Any]
 Registered = TypeVar("Registered", bound=Presenter)
 
-_PRESENTERS: dict[tuple[str, type], Presenter] = {}
+_PRESENTERS: dict[tuple[str, str], Presenter] = {}
 _MODULES: dict[str, list[str]] = {}
 """Beginning of a name of presenters -> modules that register them."""
 
@@ -29,17 +29,23 @@ def name_presenters(**modules: Sequence[str]) -> None:
         _MODULES.setdefault(name, []).extend(named)
 
 
-def register(name: str, *classes: type) -> Callable[[Registered], Registered]:
-    """Return a decorator of the function that makes the "page" or a "figure" of these classes.
+def register(name: str, *classes: type | str) -> Callable[[Registered], Registered]:
+    """Return a decorator of the function that makes the "page" or a "figure" of these classes, or
+    of classes at places such as `package.module:Class`, which are not imported for it.
 
     The name of a figure of several is `figure NAME`.
     """
 
     def add(function: Registered) -> Registered:
-        _PRESENTERS.update({(name, of_class): function for of_class in classes})
+        places = (_name_place(of) if isinstance(of, type) else of for of in classes)
+        _PRESENTERS.update({(name, place): function for place in places})
         return function
 
     return add
+
+
+def _name_place(of_class: type) -> str:
+    return f"{of_class.__module__}:{of_class.__qualname__}"
 
 
 def find_presenter(name: str, of_class: type) -> Presenter | None:
@@ -47,8 +53,8 @@ def find_presenter(name: str, of_class: type) -> Presenter | None:
     for module in _MODULES.get(name.partition(" ")[0], ()):
         import_module(module)
     for base in of_class.__mro__:
-        if (name, base) in _PRESENTERS:
-            return _PRESENTERS[name, base]
+        if (function := _PRESENTERS.get((name, _name_place(base)))) is not None:
+            return function
     return None
 
 

@@ -35,12 +35,12 @@ from loopcal.report.document.elements import (
 )
 from loopcal.report.document.figures import FIGURES, draw_figures
 from loopcal.report.validation_view import (
-    READING_NOISE,
     describe_commanded,
     describe_improvements,
     view_error_statistics,
     view_errors,
 )
+from loopcal.report.words import say
 from loopcal.results.tables import (
     ABSENT,
     Column,
@@ -93,21 +93,6 @@ def build_sections(record: CalibrationRecord, names: Iterable[str]) -> tuple[Sec
 
 # The page to sign: what was calibrated, by whom and how, the result, and the decision rule.
 
-RULE = (
-    "Decision rule: {rule}. The result is conformity if the largest error keeps the limit with a "
-    "probability of at least {level:.3g} %. It is nonconformity if the error exceeds the limit "
-    "with this probability, and neither otherwise."
-)
-NO_RULE = "The run has no limit, so this document does not decide on conformity."
-NO_VOLUME = "The run has no working volume, so the result holds for the measured poses."
-NO_RESULT = (
-    "The fit held out no pose and the run has no working volume, so the document has no "
-    "error of the calibrated machine."
-)
-VALIDITY = (
-    "The result holds for the geometry of the machine under the conditions of the measurement, not "
-    "for other loads, temperatures or speeds. Uncertainties have a coverage probability of 95 %."
-)
 SIGNATURE = ("signed by", "issued")
 """Facts at the end of the page."""
 
@@ -118,12 +103,13 @@ def describe_summary(record: CalibrationRecord) -> Iterator[Element]:
     facts, volume = record.facts, record.result.get("volume") or {}
     instruments = record.result.get("instruments") or ()
     kinds = list_names(tuple(dict.fromkeys(rows.kind for rows in record.residuals)))
-    fitted, held_out = (
-        name_count(len(labels), "pose") for labels in (record.fitted_labels, record.held_out_labels)
+    method = say(
+        "summary.method",
+        parameters=len(record.result["fit"]["parameters"]),
+        kinds=kinds or "unknown",
+        fitted=len(record.fitted_labels),
+        held_out=len(record.held_out_labels),
     )
-    method = f"{name_count(len(record.result['fit']['parameters']), 'geometric parameter')} "
-    method += f"identified from measurements ({kinds or 'unknown'}) at {fitted}, "
-    method += f"validated at {held_out} outside the fit, with uncertainty by JCGM 100 (GUM)"
     stated = {
         **{name: text for name, text in facts.items() if name not in SIGNATURE},
         "machine": facts.get("machine") or record.robot.name,
@@ -133,13 +119,12 @@ def describe_summary(record: CalibrationRecord) -> Iterator[Element]:
     yield Form(tuple(stated.items()))
     columns = ("error", *map(Column, ("before", "after", "limit")), "decision")
     result = make_table("Result", columns, _list_results(record))
-    yield result if result.rows else NO_RESULT
+    yield result if result.rows else say("summary.no-result")
     judged = [each for each in (volume, record.result.get("validation") or {}) if each]
     rules = [rule for each in judged for rule in _list_rules(each.get("conformity"))]
-    where = f"Working volume: {volume.get('words', '')}; {volume['frame']}." if volume else ""
-    yield where or NO_VOLUME
-    yield RULE.format(**rules[0]) if rules else NO_RULE
-    yield VALIDITY
+    yield say("summary.volume", **volume) if volume else say("summary.no-volume")
+    yield say("summary.rule", **rules[0]) if rules else say("summary.no-rule")
+    yield say("summary.validity")
     yield Form((*((name, facts.get(name, "")) for name in SIGNATURE), ("signature", "")))
 
 
@@ -211,29 +196,6 @@ ISO_9283 = {"AP_p": "pose accuracy AP of positions", "RP_l": "pose repeatability
 
 # Verdict and scope: may the values be used, what does that cover, and how accurate are poses.
 
-MEANING = {
-    Verdict.CALIBRATED: "All quality gates are met, held-out poses were predicted, and there is no "
-    "warning. The recommendation below states whether to use the corrected values.",
-    Verdict.RESERVATIONS: "All quality gates are met, but the warnings below affect the accuracy "
-    "of the corrected values. The recommendation below states whether to use them.",
-    Verdict.UNDECIDED: "The held-out poses do not suffice to state the accuracy at poses that were "
-    "not fitted.",
-    Verdict.NOT_CALIBRATED: "A quality gate is not met. Do not write these values to a machine.",
-}
-"""What each verdict means for the user."""
-
-LIMIT_MISSED = (
-    "The fit meets its quality gates, but a stated limit is not kept: see the statement below. The "
-    "recommendation states whether to use the corrected values."
-)
-"""What the same verdict means where it is due to a limit."""
-
-SCOPE = (
-    "Scope: the verdict concerns the geometry of {robot} in the region and under the conditions of "
-    "the measured poses ({fitted} fitted, {held_out} held out). It does not cover errors that did "
-    "not act during the measurement, such as those of other loads, temperatures or speeds."
-)
-
 CONFORMITY = "conformity."
 """Beginning of the codes of statements on limits."""
 
@@ -256,11 +218,13 @@ IMPORTANT = ("refusal", "failure", "warning")
 def describe_verdict(record: CalibrationRecord) -> Iterator[Element]:
     """Yield verdict, scope, expected error with its sources, limits, findings and next step."""
     result = record.result
-    fitted, held_out = len(record.fitted_labels), len(record.held_out_labels)
     is_missed = record.verdict is Verdict.RESERVATIONS and result.get("passed") is False
-    yield LIMIT_MISSED if is_missed else MEANING[record.verdict]
-    yield SCOPE.format(
-        robot=record.robot.name, fitted=fitted or "an unknown number", held_out=held_out
+    yield say(f"verdict.{'limit-missed' if is_missed else record.verdict.name.lower()}")
+    yield say(
+        "verdict.scope",
+        robot=record.robot.name,
+        fitted=len(record.fitted_labels),
+        held_out=len(record.held_out_labels),
     )
     budget = result.get("expected_error")
     if budget and result.get("states_expected_error"):
@@ -300,43 +264,18 @@ def select_findings(record: CalibrationRecord, codes: tuple[str, ...]) -> list[E
 
 # Errors at held-out poses, and the accuracy over the workspace.
 
-BASELINE = (
-    "Before: the geometry before calibration, with frames, targets, surfaces and offsets fitted to "
-    "the rows of the calibration. After: the calibrated geometry. Noise floor: the error that the "
-    "stated noise of the measured values alone causes."
-)
-STATED_FRAME = "The stated frame is the one in which the measurement files state their values."
-
-HEIGHTS = (
-    "A height error is the height that a geometry predicts at the recorded readings minus the "
-    "measured one: positive where the bed seems too high. Before: the geometry before calibration, "
-    "with frames, surfaces and offsets fitted to the rows of the calibration. Errors at fitted "
-    "points are optimistic, those at held-out points are not."
-)
-
-NOT_HELD_OUT = (
-    "No pose was held out of this fit, so the report has no error at poses that were not fitted."
-)
-NOT_STORED = (
-    "This run folder was written by an earlier version, whose errors at held-out poses cannot be "
-    "shown here. Repeat the calibration to see them."
-)
-
 
 @describes_section("errors", "Errors at held-out poses")
 def describe_errors(record: CalibrationRecord) -> Iterator[Element | None]:
     """Yield the errors at held-out poses before and after, with the noise floor."""
     errors = record.validation
     if errors is None:
-        if not record.held_out_labels:
-            yield NOT_HELD_OUT
-        elif record.result.get("validation") is None:
-            yield "loopcal could not compute the errors at the held-out poses. See the findings."
-        else:
-            yield NOT_STORED
+        why = "computed" if record.result.get("validation") is None else "stored"
+        yield say(f"errors.not-{why if record.held_out_labels else 'held-out'}")
         return
-    explained = f"{BASELINE} {STATED_FRAME}" if "stated frame" in errors.frame else BASELINE
-    yield f"{explained} {READING_NOISE}" if record.result.get("reading_errors") else explained
+    explained = say("errors.baseline", is_stated_frame="stated frame" in errors.frame)
+    noted = [say("errors.reading-noise")] if record.result.get("reading_errors") else []
+    yield " ".join((explained, *noted))
     yield from view_errors(errors, "held-out")
     yield from filter(None, [" ".join(describe_improvements(errors))])
     yield from (table for table in view_error_statistics(errors) if not isinstance(table, str))
@@ -346,7 +285,7 @@ def describe_errors(record: CalibrationRecord) -> Iterator[Element | None]:
 def describe_heights(record: CalibrationRecord) -> Iterator[Element | None]:
     """Yield the errors of heights over x and y, where heights were measured."""
     if record.heights is not None:
-        yield HEIGHTS
+        yield say("errors.heights")
         yield build_height_summary(record.heights)
         yield None
         yield build_height_map(record.heights)
@@ -385,44 +324,24 @@ def describe_workspace(record: CalibrationRecord) -> Iterator[Element | None]:
 
 # Parameters with their uncertainty, correlations, and the uncertainty budget.
 
-TERMS = (
-    "The terms are those of JCGM 100 (GUM) and JCGM 200 (VIM). The standard uncertainty u is one "
-    "standard deviation. The expanded uncertainty is U = k u, with the coverage factor k of "
-    "Student's t distribution for a coverage probability of 95 % and the effective degrees of "
-    "freedom by Welch and Satterthwaite. The shift is the estimate minus the nominal value, "
-    "divided by the tolerance (a standard deviation)."
-)
-BUDGET_TERMS = (
-    "Evaluation of type A uses the scatter of these data, type B uses stated values such as the "
-    "sigma of the instrument and the tolerances. A position or orientation error is the length of "
-    "a vector, so the table has no coverage factor for it. The parameters below have one."
-)
-NOT_TRACEABLE = (
-    "The data have no serial number, certificate or date of calibration of the instrument, so "
-    "this report does not show traceability."
-)
-
 
 @describes_section("budget", "Uncertainty budget")
 def describe_budget(record: CalibrationRecord) -> Iterator[Element]:
     """Yield the uncertainty budget by source, and the stated facts of each instrument."""
     budget = record.result.get("expected_error")
     if not budget or budget.get("sources") is None:
-        yield "This fit has no intervals, so there is no uncertainty budget."
+        yield say("budget.none")
     else:
-        yield BUDGET_TERMS
+        yield say("budget.terms")
         if not record.result.get("states_expected_error"):
-            yield (
-                "The residuals exceed the stated noise, so these numbers are not the expected "
-                "error of the machine."
-            )
+            yield say("budget.not-expected")
         yield from build_gum_tables(budget, record.robot)
         yield build_budget_table(budget, record.robot)
     stated = (record.result.get("volume") or {}).get("findings", ())
     yield from (f["text"] for f in stated if not f["code"].startswith(CONFORMITY))
     instruments = record.result.get("instruments") or ()
     if not instruments:
-        yield NOT_TRACEABLE
+        yield say("budget.not-traceable")
         return
     names = dict.fromkeys(name for facts in instruments for name in facts)
     columns = (word_column(name.replace("_", " "), wraps=True) for name in names)
@@ -439,7 +358,7 @@ def describe_parameters(record: CalibrationRecord) -> Iterator[Element | None]:
     if not record.converged:
         yield build_last_value_table(fit["parameters"])
     else:
-        yield TERMS
+        yield say("parameters.terms")
         yield build_parameter_table("Identified parameters", fit["parameters"], is_complete=True)
         if fit.get("interval_note"):
             yield fit["interval_note"]
@@ -451,33 +370,18 @@ def describe_parameters(record: CalibrationRecord) -> Iterator[Element | None]:
 # What the data leave open: undetermined combinations, outlying rows and residuals.
 
 
-def _describe_undetermined(record: CalibrationRecord) -> str:
-    """Return how much the data determine."""
-    fit = record.result["fit"]
-    count, rank = len(fit["parameters"]), fit["rank"]
-    if not record.converged:
-        return "The fit did not converge, so it does not show what the data determine."
-    if rank == count:
-        return f"The data determine all {count} parameters."
-    return f"The data determine {rank} of {count} combinations of the parameters."
-
-
-OTHERS = (
-    "The report leaves out {others} that only move frames or bodies, or follow the first few. "
-    "result.json of the run lists each."
-)
-
-
 @describes_section("determined", "What the data do not determine")
 def describe_open_combinations(record: CalibrationRecord) -> Iterator[Element]:
     """Yield what the data do not determine, and which measurement would determine it."""
-    yield _describe_undetermined(record)
+    count, rank = len(record.result["fit"]["parameters"]), record.result["fit"]["rank"]
+    known = ("all" if rank == count else "some") if record.converged else "not-converged"
+    yield say(f"determined.{known}", rank=rank, count=count)
     stated = [finding for finding in record.findings if finding["code"].startswith(OPEN)]
     found = [finding for finding in stated if finding["code"] in COMBINATIONS]
     shown = [f for f in found if not f["data"].get("meaning")][:MOST_COMBINATIONS]
     yield from list_findings(f for f in stated if f in shown or f not in found)
     if others := len(found) - len(shown):
-        yield OTHERS.format(others=name_count(others, "combination"))
+        yield say("determined.others", others=others)
     named = [set(finding["data"]["names"]) for finding in shown]
     for suggestion in record.result.get("remedies") or ():
         if set(suggestion["names"]) in named:
@@ -492,7 +396,7 @@ def describe_outliers(record: CalibrationRecord) -> Iterator[Element]:
     if excluded := record.result["fit"].get("dropped"):
         yield f"Excluded from the fit by its options: {', '.join(excluded)}."
     elif not stated:
-        yield "loopcal did not search for outlying rows, because the fit did not converge."
+        yield say("outliers.not-searched")
 
 
 @describes_section("residuals", "Residuals of the fit")
@@ -515,21 +419,15 @@ LINES = 40
 MOST = 3000
 """Labels of poses that the report lists."""
 
-EVERYWHERE = (
-    "The command loopcal export writes the parameters to a file: of every robot as csv or json, "
-    "and in the formats of controllers that can express it. Where a note says that these values "
-    "move programs, it also writes others that leave them where they are, if there are any."
-)
-
 
 @describes_section("controller", "Values for the controller")
 def describe_controllers(record: CalibrationRecord) -> Iterator[Element]:
     """Yield what to write into which controller."""
     if record.verdict is Verdict.NOT_CALIBRATED:
-        yield "The calibration failed, so the report has no values for a controller."
+        yield say("controller.failed")
         return
     if not record.controllers:
-        yield "No format of a controller that loopcal writes can express this robot."
+        yield say("controller.none")
     noted = [note for values in record.controllers for note in values.notes]
     of_all = {note for note in noted if 1 < noted.count(note) == len(record.controllers)}
     for values in record.controllers:
@@ -537,15 +435,13 @@ def describe_controllers(record: CalibrationRecord) -> Iterator[Element]:
         if len(lines) <= LINES:
             yield Code(f"{values.format}: {values.what}", "\n".join(lines))
         else:
-            yield (
-                f"{values.format} ({values.what}): {len(lines)} lines, too many for this page. The "
-                "command loopcal export writes them to a file."
-            )
+            facts = {"format": values.format, "what": values.what}
+            yield say("controller.too-long", lines=len(lines), **facts)
         if notes := tuple(("note", note) for note in values.notes if note not in of_all):
             yield Listing(notes)
     if of_all:
         yield Listing(tuple(("note", note) for note in sorted(of_all)))
-    yield EVERYWHERE
+    yield say("controller.everywhere")
 
 
 @describes_section("findings", "Other findings")
@@ -585,11 +481,8 @@ def describe_provenance(record: CalibrationRecord) -> Iterator[Element]:
 @describes_section("poses", "Fitted and held-out poses")
 def describe_poses(record: CalibrationRecord) -> Iterator[Element]:
     """Yield the labels of the fitted and held-out poses."""
-    unknown = (
-        "This run folder was written by an earlier version and does not name its fitted poses."
-    )
-    yield _list_labels("fitted", record.fitted_labels) or unknown
-    yield _list_labels("held-out", record.held_out_labels) or "No pose was held out."
+    yield _list_labels("fitted", record.fitted_labels) or say("poses.unknown")
+    yield _list_labels("held-out", record.held_out_labels) or say("poses.none")
 
 
 def _list_labels(what: str, labels: Sequence[str]) -> str:

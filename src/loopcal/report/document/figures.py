@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import lru_cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -37,6 +37,7 @@ from loopcal.report.scene.scene import (
     compute_pose_errors,
     format_scene,
 )
+from loopcal.report.words import say
 from loopcal.units import find_unit
 
 if TYPE_CHECKING:
@@ -73,6 +74,12 @@ def draw_figures(section: str, record: CalibrationRecord) -> Iterator[Element]:
             yield from draw(record)
 
 
+def show_figure(figure: Figure, name: str, scene: str = "", **data: Any) -> Picture:
+    """Return a figure as a picture with the words of this name, filled with data."""
+    caption, description = (say(f"{name}.{key}", **data) for key in ("caption", "description"))
+    return make_picture(figure, name, caption, description, scene)
+
+
 def make_picture(
     figure: Figure, name: str, caption: str, description: str, scene: str = ""
 ) -> Picture:
@@ -86,32 +93,18 @@ def draw_residual_picture(record: CalibrationRecord) -> Iterator[Element]:
     if not record.converged:
         return
     if not record.residuals:
-        yield (
-            "This run folder was written by an earlier version and does not contain the labels of "
-            "its residuals. Repeat the calibration to see them."
-        )
+        yield say("residual-figure.not-stored")
         return
     count = sum(len(rows.raw) for rows in record.residuals)
     residuals = [thin_rows(rows, count) for rows in record.residuals]
     if count > MOST_ROWS:
-        yield f"The figure shows {sum(len(r.raw) for r in residuals):,} of {count:,} rows."
-    shrinkage = "The fit follows its data, so residuals of few rows are smaller than their errors."
-    if any(rows.kind == ActuatorReadings.name for rows in residuals):
-        shrinkage = (
-            "The actuator readings are uncertain, so every pose is estimated too and follows its "
-            "measured values. Residuals far below one sigma are therefore normal. Chi-square "
-            "above allows for that."
-        )
+        shown = sum(len(rows.raw) for rows in residuals)
+        yield say("residual-figure.part", shown=shown, count=count)
     setup = [row["name"] for row in record.result["fit"].get("local") or ()]
-    yield make_picture(
+    yield show_figure(
         draw_residual_rows(record.robot, residuals, setup),
         "residual-figure",
-        "Residuals of the fitted rows.",
-        "The panels show the residuals in the order of the poses, by component, as "
-        "histogram and normal plot, and against readings and recorded quantities. Whitened "
-        "residuals "
-        "are divided by their sigma. Of errors with the stated noise 95 % lie between the dashed "
-        f"lines. {shrinkage}",
+        has_readings=any(rows.kind == ActuatorReadings.name for rows in residuals),
     )
 
 
@@ -139,15 +132,9 @@ def draw_validation_picture(record: CalibrationRecord) -> Iterator[Element]:
     if errors is None or not errors.quantities:
         return
     if len(errors.poses) > MOST_ROWS:
-        yield f"The errors of {len(errors.poses):,} rows are too many for a figure."
-        return
-    yield make_picture(
-        draw_validation(errors),
-        "validation-figure",
-        "Errors at held-out poses before and after calibration.",
-        "For each held-out pose the figure shows the size of the error before and after "
-        "calibration, with the noise floor.",
-    )
+        yield say("validation-figure.many", count=len(errors.poses))
+    else:
+        yield show_figure(draw_validation(errors), "validation-figure")
 
 
 @report_figure("heights")
@@ -157,16 +144,9 @@ def draw_height_picture(record: CalibrationRecord) -> Iterator[Element]:
     if heights is None:
         return
     if len(heights.poses) > MOST_ROWS:
-        yield f"The errors of {len(heights.poses):,} heights are too many for a figure."
-        return
-    yield make_picture(
-        draw_height_errors(heights),
-        "height-figure",
-        "Height errors over x and y before and after calibration.",
-        "Each point is a measured height at its place x, y. Its color is the error, "
-        "predicted minus measured, in one scale before and after calibration. The fit used the "
-        "circles and held out the squares.",
-    )
+        yield say("height-figure.many", count=len(heights.poses))
+    else:
+        yield show_figure(draw_height_errors(heights), "height-figure")
 
 
 @report_figure("budget")
@@ -174,13 +154,7 @@ def draw_budget_picture(record: CalibrationRecord) -> Iterator[Element]:
     """Yield the sources of the expected error as bars."""
     budget = record.result.get("expected_error")
     if budget and budget.get("sources"):
-        yield make_picture(
-            draw_budget_sources(budget),
-            "budget-figure",
-            "Expected error by source.",
-            "A bar is the part of a source in the root mean square error. A diamond is the error "
-            "of all sources if the sigma of this one were half as large.",
-        )
+        yield show_figure(draw_budget_sources(budget), "budget-figure")
 
 
 @report_figure("workspace")
@@ -188,16 +162,16 @@ def draw_scene_picture(record: CalibrationRecord) -> Iterator[Element]:
     """Yield the robot at home with the measured poses and the errors that calibration removes."""
     readings = record.readings
     if not record.converged:
-        yield "The fit did not converge, so the calibrated geometry is missing."
+        yield say("scene-figure.not-converged")
         return
     if readings is None or not len(readings):
-        yield "The run lacks the readings of its poses, so the picture omits them."
+        yield say("scene-figure.no-readings")
         return
     accuracy = compute_accuracy(record)
     accuracy = None if isinstance(accuracy, str) else accuracy
     rows, count = choose_evenly(len(readings), MOST_ROWS), len(readings)
     if len(rows) < count:
-        yield f"The figure shows {len(rows):,} of {count:,} fitted poses."
+        yield say("scene-figure.part", shown=len(rows), count=count)
     labels = record.fitted_labels
     if len(labels) != count:  # an older version wrote the run
         labels = tuple(str(i + 1) for i in range(count))
@@ -206,17 +180,13 @@ def draw_scene_picture(record: CalibrationRecord) -> Iterator[Element]:
     scene = Scene(record.robot, poses, accuracy, tuple(_list_motions(record)))
     in_space = len(choose_rows(record.robot, len(poses.tool)))
     if in_space < len(poses.tool):
-        yield f"The 3-D view can show the robot at {in_space:,} of these poses, evenly spread."
-    of_map = " Pale squares show the standard uncertainty of positions over the workspace by color."
-    yield make_picture(
+        yield say("scene-figure.robots", shown=in_space)
+    yield show_figure(
         draw_scene(scene),
         "scene-figure",
-        "The robot at home, and the tool point at the fitted poses.",
-        "A point is the tool at a fitted pose. The line from it is the position error of the "
-        f"geometry before calibration there, {poses.magnification:g} times magnified: its "
-        "predicted position minus that of the calibrated geometry at the same readings, in the "
-        f"base frame of the robot file.{'' if accuracy is None else of_map}",
         format_scene(scene),
+        magnification=poses.magnification,
+        has_map=accuracy is not None,
     )
 
 
@@ -226,13 +196,8 @@ def _list_motions(record: CalibrationRecord) -> Iterator[Motion]:
     """
     robot = record.robot
     names = list(robot.parameters.names)
-    changes = [
-        (
-            record.initial.values - robot.values,
-            "before calibration",
-            "The second robot is the geometry before calibration at the same readings.",
-        )
-    ]
+    error = record.initial.values - robot.values
+    changes = [(error, "before calibration", say("scene-figure.before"))]
     for row in record.result["fit"].get("unidentifiable", ()):
         change = np.zeros(len(names))
         for name, value, unit in zip(row["names"], row["changes"], row["units"], strict=True):
@@ -251,21 +216,15 @@ def draw_accuracy_picture(record: CalibrationRecord) -> Iterator[Element]:
     if isinstance(accuracy, str):
         yield accuracy
         return
-    less = int(accuracy.extrapolated.sum())
     is_part = record.readings is not None and len(record.readings) > MOST_ROWS
-    count = f" of the {MOST_ROWS:,} that are compared" if is_part else ""
-    yield (
-        f"The standard uncertainty of the pose was computed at {len(accuracy.coordinates)} poses "
-        f"of the workspace. {less} of these poses are less certain than every measured pose"
-        f"{count}. Frame: {accuracy.uncertainty.frame}."
+    yield say(
+        "accuracy-figure.summary",
+        poses=len(accuracy.coordinates),
+        less=int(accuracy.extrapolated.sum()),
+        compared=is_part and MOST_ROWS,
+        frame=accuracy.uncertainty.frame,
     )
-    yield make_picture(
-        draw_accuracy_map(accuracy),
-        "accuracy-figure",
-        "Standard uncertainty of poses over the workspace.",
-        "Slices of the workspace show the standard uncertainty of the pose by color. Circles mark "
-        "extrapolated poses, which are less certain than every measured pose.",
-    )
+    yield show_figure(draw_accuracy_map(accuracy), "accuracy-figure")
 
 
 @lru_cache(maxsize=1)  # two figures use it
@@ -273,15 +232,13 @@ def compute_accuracy(record: CalibrationRecord) -> AccuracyMap | str:
     """Return the uncertainty of poses over the workspace, or the sentence why it is not known."""
     budget, readings = record.result.get("expected_error"), record.readings
     if record.posterior is None or readings is None or not budget:
-        return "Without intervals, the accuracy over the workspace is unknown."
-    measured, frame = (
-        readings[choose_evenly(len(readings), MOST_ROWS)],
-        budget.get("frame", "fitted"),
-    )
+        return say("accuracy-figure.unknown")
+    measured = readings[choose_evenly(len(readings), MOST_ROWS)]
+    frame = budget.get("frame", "fitted")
     try:
         return accuracy_map(record.posterior, measured, MAP_POSES, SEED, frame=frame)
     except LoopcalError as error:
-        return f"The accuracy over the workspace cannot be computed: {error}"
+        return say("accuracy-figure.failed", error=error)
 
 
 @report_figure("parameters")
@@ -291,20 +248,10 @@ def draw_parameter_picture(record: CalibrationRecord) -> Iterator[Element]:
     if not record.converged:
         return
     if len(rows) > MOST_PARAMETERS:
-        yield f"{len(rows)} parameters are too many for a figure."
+        yield say("parameter-figure.many", count=len(rows))
         return
-    yield make_picture(
-        draw_parameter_rows(record.robot.name, rows),
-        "parameter-figure",
-        "Shift and uncertainty of the parameters in tolerances.",
-        "For each parameter the figure shows the estimate minus the nominal value with its 95 % "
-        "interval, and the half-width of that interval.",
-    )
+    yield show_figure(draw_parameter_rows(record.robot.name, rows), "parameter-figure")
     if len(rows) > 1:
-        names = [row["name"] for row in rows]
-        yield make_picture(
-            draw_correlation_matrix(record.robot.name, names, record.arrays["covariance"]),
-            "correlation-figure",
-            "Correlations of the parameters.",
-            "The matrix shows the correlation of each pair of parameters by color.",
-        )
+        names, covariance = [row["name"] for row in rows], record.arrays["covariance"]
+        matrix = draw_correlation_matrix(record.robot.name, names, covariance)
+        yield show_figure(matrix, "correlation-figure")

@@ -19,7 +19,12 @@ from loopcal.report.document.elements import (
     Picture,
     Section,
 )
-from loopcal.report.document.figures import compute_accuracy, draw_scene_picture, make_picture
+from loopcal.report.document.figures import (
+    compute_accuracy,
+    draw_scene_picture,
+    make_picture,
+    show_figure,
+)
 from loopcal.report.figures.result_figures import (
     draw_run_errors,
     draw_run_parameters,
@@ -28,19 +33,12 @@ from loopcal.report.figures.result_figures import (
 from loopcal.report.figures.robot_figure import draw_scene
 from loopcal.report.scene.scene import Scene, format_scene
 from loopcal.report.validation_view import build_errors, build_estimates, build_runs, build_shifts
+from loopcal.report.words import say
 
 HEADS: Mapping[bool | None, str] = {True: "not_calibrated", False: "calibrated", None: "undecided"}
 """Whether a machine has changed -> the color of the head, as of a verdict."""
-SUMMARIES: Mapping[bool | None, str] = {
-    True: "A machine differs from {first} by more than the noise.",
-    False: "The machines agree with {first} within the noise.",
-    None: "Whether a machine has changed was not tested.",
-}
-MEANING = (
-    "The first run is the reference of all others. For independent data of two runs, a change is "
-    "tested in the directions that both data sets determine. If nothing has changed, a change is "
-    "reported in 5 % of cases, for all runs together."
-)
+SUMMARIES: Mapping[bool | None, str] = {True: "changed", False: "equal", None: "untested"}
+"""The same -> the name of the sentence below the title."""
 
 
 def build_comparison_document(comparison: RunComparison, made_by: str) -> Document:
@@ -55,7 +53,7 @@ def build_comparison_document(comparison: RunComparison, made_by: str) -> Docume
     return Document(
         title=f"Comparison of calibrations: {names}",
         verdict=HEADS[comparison.moved],
-        summary=SUMMARIES[comparison.moved].format(first=comparison.runs[0].name),
+        summary=say(f"comparison.{SUMMARIES[comparison.moved]}", first=comparison.runs[0].name),
         made_by=made_by,
         sections=tuple(Section(*n, tuple(each(comparison))) for n, each in sections.items()),
     )
@@ -63,7 +61,7 @@ def build_comparison_document(comparison: RunComparison, made_by: str) -> Docume
 
 def _describe_result(comparison: RunComparison) -> Iterator[Element]:
     """Yield the findings, the most important first, and the runs."""
-    yield MEANING
+    yield say("comparison.meaning")
     if findings := sort_by_importance(comparison.findings):
         yield Listing(tuple((finding.severity.value, str(finding)) for finding in findings))
     yield build_runs(comparison)
@@ -72,28 +70,15 @@ def _describe_result(comparison: RunComparison) -> Iterator[Element]:
 def _describe_parameters(comparison: RunComparison) -> Iterator[Element]:
     """Yield estimates with intervals, side by side."""
     yield build_estimates(comparison)
-    yield make_picture(
-        draw_run_parameters(comparison),
-        "estimates-figure",
-        "Estimates of all runs with their 95 % intervals.",
-        "For each parameter the figure shows the estimate of each run minus the first run, with "
-        "its interval, in half-widths of the first run's interval. The table has the numbers.",
-    )
+    yield show_figure(draw_run_parameters(comparison), "estimates-figure")
 
 
 def _describe_shifts(comparison: RunComparison) -> Iterator[Element]:
     """Yield the tested shifts in standard deviations."""
     if all(pair.moved is None for pair in comparison.pairs):
-        yield "The runs share data or have no common direction, so loopcal tested no shift."
+        yield say("comparison.no-shift")
         return
-    yield make_picture(
-        draw_run_shifts(comparison),
-        "shift-figure",
-        "Shift of each parameter from the first run.",
-        "For each parameter the figure shows the shift in standard deviations while all others "
-        "may have changed, too. Filled markers are significant at 5 % for all parameters and runs "
-        "together. A parameter without a marker is undetermined in one of the data sets.",
-    )
+    yield show_figure(draw_run_shifts(comparison), "shift-figure")
     yield build_shifts(comparison)
 
 
@@ -101,13 +86,7 @@ def _describe_errors(comparison: RunComparison) -> Iterator[Element]:
     """Yield the errors after calibration, at common poses or at those of each run."""
     yield build_errors(comparison)
     if any(run.common or run.own for run in comparison.errors):
-        yield make_picture(
-            draw_run_errors(comparison),
-            "errors-figure",
-            "Errors of each run after calibration.",
-            "Bars are root mean squares and dots are the largest errors of each run. Errors at "
-            "poses that are not common to all runs also differ because the poses do.",
-        )
+        yield show_figure(draw_run_errors(comparison), "errors-figure")
 
 
 # The page of `loopcal view`: a robot in space, of a calibration with its poses and errors.
@@ -142,7 +121,7 @@ def _draw_home(robot: Mechanism) -> Picture:
     return make_picture(
         draw_scene(scene),
         "scene-figure",
-        "The robot at home.",
-        "The picture shows limbs, joints, rods, platform and tool, in space and from above.",
+        say("home-figure.caption"),
+        say("home-figure.description"),
         format_scene(scene),
     )
