@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from loopcal.diagnose.residual_patterns import FitRoot, ResidualRows
 from loopcal.io.robot.robot_file import load_robot
 from loopcal.measure.instrument import Gaussian, Instrument, Sensor
 from loopcal.measure.kinds.poses import Component, Pose
@@ -15,6 +16,7 @@ from loopcal.measure.kinds.position import Position
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.simulation import sample_truth, simulate
 from loopcal.mechanism.workspace import sample_workspace
+from loopcal.numerics.split_columns import SplitColumns
 
 LENGTH, ANGLE = 5e-6, 25e-6
 """Stated noise [m], [rad]."""
@@ -66,3 +68,11 @@ def draw_errors(n: int, m: int, seed: int, correlation: float = 0.0) -> np.ndarr
     for i in range(1, n):
         errors[i] = correlation * errors[i - 1] + np.sqrt(1.0 - correlation**2) * drawn[i]
     return errors
+
+
+def make_residual_rows(basis, errors, series=None):
+    """Return rows (R,) with given errors, from which what is estimated, basis (R, q), is taken."""
+    zero, columns = np.zeros(len(errors), dtype=np.int64), SplitColumns.of(basis)
+    root = FitRoot(np.eye(basis.shape[1]), zero[:0], None)
+    numbers = zero, zero, zero, zero if series is None else series
+    return ResidualRows(columns, columns.remove(errors), columns, root, *numbers)

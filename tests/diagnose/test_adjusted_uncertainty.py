@@ -126,7 +126,8 @@ def test_the_covariance_is_that_of_a_dense_restricted_likelihood():
     assert rows is not None
     result = estimate_correlated_errors(rows, 8.0)
     # the likelihood of the rows A r that no parameter changes, A from the full QR of the basis
-    A = np.linalg.qr(rows.basis, mode="complete")[0][:, rows.basis.shape[1] :].T
+    basis, gain = rows.basis.toarray(), rows.gain.toarray()
+    A = np.linalg.qr(basis, mode="complete")[0][:, basis.shape[1] :].T
     y, logs, parts = A @ rows.residual, [], []
     for rho in RHO:
         for share in SHARE if rho else (1.0,):
@@ -136,7 +137,7 @@ def test_the_covariance_is_that_of_a_dense_restricted_likelihood():
             total = 8.0 + y @ np.linalg.solve(inside, y)
             nu = len(y) + 8.0
             logs.append(-0.5 * (np.linalg.slogdet(inside)[1] + nu * np.log(total)))
-            parts.append(total / nu * rows.gain.T @ K @ rows.gain)
+            parts.append(total / nu * gain.T @ K @ gain)
     weight = np.exp(np.array(logs) - max(logs))
     expected = np.tensordot(weight / weight.sum(), np.array(parts), 1)
     assert np.allclose(result.covariance, expected, rtol=1e-6, atol=1e-9 * expected.max())

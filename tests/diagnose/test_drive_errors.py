@@ -65,7 +65,8 @@ def test_size_maximizes_the_restricted_likelihood_of_a_dense_covariance(known: f
     data = measure_hexapod(3, SIGMA, 12, error=REPEATABILITY).data
     rows, drives, spectrum = find_spectrum(linearize(data))
     Z = drives.scaled
-    noise = np.linalg.qr(np.c_[rows.basis, np.eye(len(Z))])[0][:, rows.basis.shape[1] : len(Z)]
+    basis = rows.basis.toarray()
+    noise = np.linalg.qr(np.c_[basis, np.eye(len(Z))])[0][:, basis.shape[1] : len(Z)]
     y, A = noise.T @ rows.residual, noise.T @ Z  # what nothing estimated explains
 
     def compute_likelihood(tau: float) -> float:

@@ -19,6 +19,7 @@ from loopcal.diagnose.error_causes import (
 from loopcal.diagnose.residual_patterns import CAUSE, Effect
 from loopcal.estimate.fit_linearization import linearize_fit
 from loopcal.estimate.identification import identify
+from loopcal.numerics.split_columns import SplitColumns
 from loopcal.numerics.statistics import Remainder
 from loopcal.units import Dimension
 from tests.diagnose.correlated_data import LENGTH, ROBOTS, draw_errors, measure
@@ -106,7 +107,9 @@ def draw_remainder(rng, rows=40, estimated=10):
     """Return residuals of normal errors, and the basis of what nothing estimated explains."""
     Q = np.linalg.qr(rng.standard_normal((rows, rows)))[0]
     residual = Q[:, estimated:] @ rng.standard_normal(rows - estimated)
-    return Remainder(Q[:, :estimated], residual, rows - estimated), Q[:, estimated:]
+    return Remainder(SplitColumns.of(Q[:, :estimated]), residual, rows - estimated), Q[
+        :, estimated:
+    ]
 
 
 def test_a_component_is_taken_into_the_inverse_of_the_covariance():

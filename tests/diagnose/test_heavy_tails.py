@@ -14,12 +14,11 @@ from loopcal.diagnose.adjusted_uncertainty import (
     check_heavy_tails,
 )
 from loopcal.diagnose.fit_examination import examine_fit
-from loopcal.diagnose.residual_patterns import ResidualRows
 from loopcal.estimate.identification import identify
 from loopcal.estimate.losses import Huber
 from loopcal.findings import Severity
 from loopcal.results.serialization import to_json
-from tests.diagnose.correlated_data import ROBOTS, draw_errors, measure
+from tests.diagnose.correlated_data import ROBOTS, draw_errors, make_residual_rows, measure
 
 CODE = "residuals.heavy-tailed"
 N = 30
@@ -37,13 +36,6 @@ def fit_delta(errors, seed=0):
     return adjust_uncertainty(identify(ROBOTS["linear-delta"], data), data), data
 
 
-def make_rows(errors, basis):
-    """Return rows with given errors, from which what is estimated is removed."""
-    residual = errors - basis @ (basis.T @ errors)
-    zero, root = np.zeros(len(residual), dtype=int), np.eye(basis.shape[1])
-    return ResidualRows(basis, residual, basis, root, zero, zero, zero, zero)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(("rows", "taken"), [(30, 18), (60, 20), (1400, 40)])
 def test_normal_errors_of_few_correlated_or_many_residuals_have_the_stated_level(rows, taken):
@@ -51,7 +43,10 @@ def test_normal_errors_of_few_correlated_or_many_residuals_have_the_stated_level
     basis = np.linalg.qr(rng.standard_normal((rows, taken)) ** 3)[0]  # uneven leverage
     count = 120 if rows < 1000 else 30
     p = np.array(
-        [assess_tails(make_rows(e, basis)).p_value for e in rng.standard_normal((count, rows))]
+        [
+            assess_tails(make_residual_rows(basis, e)).p_value
+            for e in rng.standard_normal((count, rows))
+        ]
     )
     # probabilities above 0.05 come from few draws, but are not biased
     assert kstest(p, "uniform").pvalue > 1e-3
@@ -96,7 +91,7 @@ def test_fits_with_a_loss_or_few_degrees_of_freedom_are_not_tested():
     robust = identify(ROBOTS["linear-delta"], data, loss=Huber())
     assert np.isnan(check_heavy_tails(robust, data).p_value)
     basis = np.linalg.qr(np.random.default_rng(0).standard_normal((20, 17)))[0]
-    rows = make_rows(np.ones(20), basis)
+    rows = make_residual_rows(basis, np.ones(20))
     assert np.isnan(assess_tails(rows).p_value)
 
 

@@ -11,19 +11,14 @@ from scipy.stats import f as f_distribution
 from scipy.stats import kstest
 
 from loopcal.diagnose.error_causes import explain_residuals
-from loopcal.diagnose.residual_patterns import (
-    ResidualRows,
-    collect_residual_rows,
-    estimate_sizes,
-    list_effects,
-)
+from loopcal.diagnose.residual_patterns import collect_residual_rows, estimate_sizes, list_effects
 from loopcal.diagnose.residual_patterns import test_correlation as compute_correlation
 from loopcal.diagnose.residual_patterns import test_effect as compute_tail
 from loopcal.estimate.fit_linearization import linearize_fit
 from loopcal.estimate.identification import identify
 from loopcal.estimate.penalties import LeastSquares, Ridge
 from loopcal.numerics.statistics import compute_any_probability, compute_single_level
-from tests.diagnose.correlated_data import ROBOTS, draw_errors, measure
+from tests.diagnose.correlated_data import ROBOTS, draw_errors, make_residual_rows, measure
 
 
 def collect(robot, kind, errors, seed, method=None, **context):
@@ -61,21 +56,15 @@ def test_independent_errors_give_uniform_probabilities(robot, kind, n, method, f
         assert kstest(column, "uniform").pvalue > 1e-3
 
 
-def make_rows(residual, basis, series):
-    """Return rows with given errors, from which what is estimated is removed."""
-    residual = residual - basis @ (basis.T @ residual)
-    n = len(residual)
-    zero = np.zeros(n, dtype=int)
-    return ResidualRows(basis, residual, basis, np.eye(basis.shape[1]), zero, zero, zero, series)
-
-
 def test_correlation_has_its_stated_probabilities_where_the_fit_takes_up_half_of_the_rows():
     rng = np.random.default_rng(3)
     series = np.repeat(np.arange(3), 10)
     smooth = np.cos(np.outer(np.arange(10), np.arange(5)) * np.pi / 10)
     basis = np.linalg.qr(np.kron(np.eye(3), smooth))[0]  # takes up what changes slowly
     drawn = rng.standard_normal((2000, 30))
-    p_values = np.array([compute_correlation(make_rows(e, basis, series))[1] for e in drawn])
+    p_values = np.array(
+        [compute_correlation(make_residual_rows(basis, e, series))[1] for e in drawn]
+    )
     assert kstest(p_values, "uniform").pvalue > 1e-3
     assert 0.03 < (p_values < 0.05).mean() < 0.07
     assert 0.002 < (p_values < 0.01).mean() < 0.02
@@ -86,7 +75,9 @@ def test_effects_are_compared_with_the_f_distribution_of_two_nested_fits():
     effects = list_effects(rows, data, ROBOTS["linear-delta"])
     for effect in (e for e in effects if e.columns.shape[1]):
         # the same by dense least squares without and with the columns of the effect
-        X = np.column_stack([rows.basis, effect.columns / np.linalg.norm(effect.columns, axis=0)])
+        X = np.column_stack(
+            [rows.basis.toarray(), effect.columns / np.linalg.norm(effect.columns, axis=0)]
+        )
         left = rows.residual - X @ np.linalg.lstsq(X, rows.residual, rcond=1e-10)[0]
         q = np.linalg.matrix_rank(X, tol=1e-8) - rows.basis.shape[1]
         degrees = len(left) - q - rows.basis.shape[1]

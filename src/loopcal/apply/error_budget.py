@@ -45,6 +45,7 @@ from loopcal.estimate.result import Identification
 from loopcal.estimate.unfixed_motions import find_frame_knowledge
 from loopcal.findings import Finding, report_finding
 from loopcal.findings.wording import round_to_digits
+from loopcal.measure.array_checks import drop_repeats
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations, StatedSize, find_size
 from loopcal.mechanism.model import Mechanism
@@ -55,7 +56,7 @@ from loopcal.numerics.elimination import TreeElimination
 from loopcal.numerics.statistics import find_distinct
 from loopcal.results.description import OTHER, Field, fields, label_axes
 from loopcal.results.result import DrawnResult
-from loopcal.typing import BoolArray, FloatArray
+from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension
 
 # Kinds of sources; others are the codes of the findings with which a covariance was added.
@@ -155,7 +156,8 @@ def split_covariance(linear: FitLinearization) -> CovarianceSplit:
     common, estimate = list_common_errors(linear.problem), linear.linearization.nuisance
     for (kind, name), rows in _list_further_rows(linear, common):
         size = _find_common_size(linear, common, name) if kind == COMMON else None
-        factors += divide_by_cluster(len(sources), rows, len(fit.names), estimate)
+        for each in rows:
+            factors += divide_by_cluster(len(sources), *each, len(fit.names), estimate)
         sources.append(state(kind, name, size, "B", np.inf))
     own = _propagate(linear, factors)
     evaluation_of_size = "B (assumed)" if fit.free_parameters.assumed.any() else "B"
@@ -212,7 +214,7 @@ def _halve_sigma(
     if not moves_frames and (rows := _find_rows_alone(problem, split, source)) is not None:
         triangle = np.concatenate([at.factor[0, :p, :p], np.sqrt(3.0) * rows])
         triangle = np.asarray(np.linalg.qr(triangle, mode="r"))
-        own = _propagate(linear, divide_by_cluster(0, triangle, p, None))
+        own = _propagate(linear, _make_factors(triangle))
         return fit.tolerance[:, None] * np.concatenate(own, axis=1), at, problem
     if source.kind == TOLERANCES:
         weight = 4.0
@@ -224,8 +226,9 @@ def _halve_sigma(
                 np.eye(root.shape[1]) - 0.75 * np.swapaxes(root, 1, 2) @ root
             )
             factor = axes / np.sqrt(left)[:, None, :] @ np.swapaxes(axes, 1, 2)
-            whitener = of_kind.whitener
+            whitener = drop_repeats(of_kind.whitener)  # rows of one covariance share one matrix
             whitener = factor * whitener if root.shape[1] == 1 else factor @ whitener
+            whitener = np.broadcast_to(whitener, of_kind.whitener.shape)
             rows.append(replace(of_kind, whitener=whitener))
         problem = problem.with_rows(rows)
     elif source.kind in (SETUP, COMMON) and nuisance is not None and nuisance.has_prior.any():
@@ -241,8 +244,13 @@ def _halve_sigma(
     if fit.options.prior is not None:
         linearization = fit.options.prior.added(problem).append(linearization)
     factor = linearization.factor[0, :p, :p]
-    own = _propagate(linear, divide_by_cluster(0, factor, p, None), weight)
+    own = _propagate(linear, _make_factors(factor), weight)
     return fit.tolerance[:, None] * np.concatenate(own, axis=1), linearization, problem
+
+
+def _make_factors(rows: FloatArray) -> list[SourceFactor]:
+    """Return rows (m, p) of one source that move the machine alone."""
+    return [SourceFactor(0, np.zeros(0, dtype=np.int64), rows[:, :0], rows)]
 
 
 def _find_rows_alone(problem: Problem, split: CovarianceSplit, source: Source) -> FloatArray | None:
@@ -333,29 +341,30 @@ def list_common_errors(problem: Problem) -> list[str]:
 
 def _list_further_rows(
     linear: FitLinearization, common: list[str]
-) -> list[tuple[tuple[str, str], FloatArray]]:
-    """Return kind, name and rows (m, U + p) of stated setup parameters, of common errors, and of an
-    earlier calibration.
+) -> list[tuple[tuple[str, str], list[tuple[IntArray, FloatArray]]]]:
+    """Return kind, name and rows of stated setup parameters, of common errors, and of an earlier
+    calibration, as arguments of `divide_by_cluster`.
     """
     rows, prior = [], linear.fit.options.prior
     problem, estimate = linear.problem, linear.linearization.nuisance
     if problem.nuisance is not None and estimate is not None and problem.nuisance.has_prior.any():
         stated = problem.nuisance.has_prior
-        sd = problem.nuisance.local.table.tolerance[stated]
+        names, sd = np.array(common), problem.nuisance.local.table.tolerance
         done = estimate.elimination
-        both = np.concatenate([done.joint_root()[0], done.slope[0]], axis=1)[stated] / sd[:, None]
-        names = np.array(common)[stated]
-        rows += [
-            ((COMMON if name else SETUP, name), both[names == name])
-            for name in find_distinct(names).tolist()
-        ]
+        for name in find_distinct(names[stated]).tolist():
+            parts = []
+            for s, root in zip(done.tree.structures, done.roots, strict=True):
+                place, column = np.nonzero((stated & (names == name))[s.unknowns])
+                own = s.unknowns[place, column]
+                both = np.concatenate([root[0, place, column], done.slope[0, own]], axis=1)
+                parts.append((s.path[place], (both / sd[own, None])[:, None]))
+            rows.append(((COMMON if name else SETUP, name), parts))
     if prior is not None:
         measured = problem.linearize(
             linear.linearization.deviation, linear.linearization.next_start
         )
         slope = prior.added(problem).list_slopes(measured)[0]
-        nothing = np.zeros((len(slope), len(common)))
-        rows.append(((EARLIER, ""), np.concatenate([nothing, slope], axis=1)))
+        rows.append(((EARLIER, ""), [(np.zeros((len(slope), 0), np.int64), slope[:, None])]))
     return rows
 
 
@@ -416,7 +425,7 @@ def _separate_setup(
             continue
         whole = factors[group[0]].unknowns
         motion = noise * np.concatenate([factors[i].setup for i in group]).T
-        D = done.joint_root(whole)[0][is_setup[whole]] @ motion
+        D = done.joint_root(whole)[is_setup[whole]] @ motion
         e = np.concatenate([errors[i] for i in group], axis=1)
         length = np.sqrt((D**2).sum(axis=1) + ((slope[unknowns] @ e) ** 2).sum(axis=1))
         length = np.where(length > 0.0, length, 1.0)[:, None]

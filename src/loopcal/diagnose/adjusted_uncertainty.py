@@ -174,7 +174,7 @@ def _add_patterns(
     tool = [(E, float(((E @ posterior.root) ** 2).sum())) for E in effects_of]
     for effect in effects:
         moments = take_root(effect.moments, np.diag(effect.moments))
-        root = rows.root @ (rows.gain.T @ effect.effect.acting) @ moments
+        root = rows.move(effect.effect.acting) @ moments
         finding = _report_effect(effect, _measure_growth(tool, root))
         fit = add_covariance(fit, root, effect.degrees, finding)
     for cause in shared:
@@ -183,7 +183,7 @@ def _add_patterns(
         # of many poses only some have columns, and errors of more of them cancel
         times = share * max(data.n_poses / EVEN_CHOICE, 1.0) if cause.source == POSE else 1.0
         size = np.sqrt(times * cause.size.variance)
-        root = rows.root @ (rows.gain.T @ cause.effect.scaled) * size
+        root = rows.move(cause.effect.scaled) * size
         finding = _report_shared(cause, _measure_growth(tool, root))
         fit = add_covariance(fit, root, cause.size.degrees, finding)
     if is_correlated:
@@ -235,17 +235,17 @@ def _add_correlation(
     """
     errors = estimate_correlated_errors(rows, fit.residual_test.sigma_degrees)
     independent = np.diag(np.full(len(errors.covariance), fit.residual_test.sigma_scale**2))
-    k = len(independent) - len(fit.nuisance)
-    independent[:k, :k] = 0.0
+    s = len(rows.root.setup)
+    independent[s:, s:] = 0.0
     for part in (part for part in fit.posterior.parts if part.source == NOISE):
         scaled = part.root / fit.tolerance[:, None]
-        directions = rows.root[: len(scaled), :k] / fit.tolerance[:, None]
+        directions = rows.root.machine / fit.tolerance[:, None]
         by_noise = np.linalg.lstsq(directions, scaled, rcond=None)[0]
-        independent[:k, :k] += by_noise @ by_noise.T
+        independent[s:, s:] += by_noise @ by_noise.T
     # what correlated errors cause beyond independent ones, where that is more
     covariance = share * errors.covariance
     more = take_root(covariance - independent, np.diag(covariance + independent))
-    root = rows.root @ more
+    root = rows.root.times(more)
     finding = report_finding(
         "residuals.correlated",
         correlation=errors.correlation,
@@ -385,10 +385,12 @@ def check_heavy_tails(
 def assess_tails(rows: ResidualRows) -> HeavyTails:
     """Return the test of residuals."""
     kept = choose_evenly(len(rows.residual), MOST_ROWS)
-    basis = rows.basis[kept]
-    left = 1.0 - (basis**2).sum(axis=1)
+    left = 1.0 - rows.basis.take(kept).squares()
     testable = left > TESTABLE
-    kept, basis, left = kept[testable], basis[testable], left[testable]
+    kept, left = kept[testable], left[testable]
+    basis = rows.basis.take(kept).toarray()
+    if basis.shape[1] > len(kept):  # as many variables do the same
+        basis = np.asarray(np.linalg.qr(basis.T, mode="r")).T
     if left.sum() < FEWEST:
         return HeavyTails(len(kept))
     member = rows.series[kept][:, None] == find_distinct(rows.series[kept])

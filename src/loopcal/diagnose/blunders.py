@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from loopcal import engine
 from loopcal.diagnose.conventions.interpretations import (
     FACTORS,
     list_orders,
@@ -28,10 +29,12 @@ from loopcal.diagnose.outliers import (
     PartialFit,
     compute_block_influence,
     iterate_blocks,
+    join_columns,
     make_empty_influence,
     search_blocks,
 )
 from loopcal.errors import LoopcalError
+from loopcal.estimate.elimination import NodeRows, fold_node_rows
 from loopcal.estimate.false_alarms import FALSE_ALARMS
 from loopcal.estimate.fit_descent import estimate_scale_of
 from loopcal.estimate.fit_linearization import FitUncertainty
@@ -43,17 +46,45 @@ from loopcal.measure.measurements import Measurements
 from loopcal.measure.readings import fill_in_reading_sigma
 from loopcal.mechanism.model import Mechanism
 from loopcal.numerics.decomposition import substitute_backward, substitute_transposed
-from loopcal.numerics.statistics import compute_chi_square_tail
+from loopcal.numerics.elimination import (
+    EliminationTree,
+    NodeFactors,
+    TreeElimination,
+    build_tree,
+    eliminate_tree,
+)
+from loopcal.numerics.statistics import compute_chi_square_tail, find_distinct
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension
 
 # Probability of naming any block where none is wrong. It is small, because a named block changes
 # the verdict.
 LEVEL = FALSE_ALARMS["held-out rows"]
-FOLDED = 10_000  # rows that are factorized at once
-TOGETHER = 16  # blocks whose rows are made at once
 # Standard deviation of an unknown nuisance parameter, in sizes of the robot or radians.
 ANYWHERE = 1e3
+
+
+class BlockRows(NamedTuple):
+    """Rows of b held-out blocks of equal size in nodes of one structure, -1 without any, by what
+    predicts them: independent standard normal variables, those of the nodes' paths first.
+    """
+
+    structure: int
+    blocks: IntArray  # (b,) their numbers
+    nodes: IntArray  # (b,)
+    rows: FloatArray  # (b, m, w + k)
+    residual: FloatArray  # (b, m)
+    present: BoolArray  # (b, m)
+
+
+class Prediction(NamedTuple):
+    """The best values of these variables, and the factor R (k, k) and best values y (k,) of those
+    that predict all blocks, the others eliminated.
+    """
+
+    elimination: TreeElimination | None
+    triangle: FloatArray
+    y: FloatArray
 
 
 class HeldOutBlocks(NamedTuple):
@@ -61,12 +92,13 @@ class HeldOutBlocks(NamedTuple):
 
     poses: tuple[tuple[str, ...], ...]  # labels of each of u blocks
     member: IntArray  # (n,) block of each pose
-    # blocks of equal size: numbers (b,), H (b, m, k), residuals (b, m), present (b, m)
-    groups: tuple[tuple[IntArray, FloatArray, FloatArray, BoolArray], ...]
+    groups: tuple[BlockRows, ...]
+    tree: EliminationTree  # of the variables that predict blocks of one session
+    shared: int  # number k of those that predict all blocks
 
     def fit_without(self, excluded: BoolArray) -> PartialFit:
         """Return the prediction by all blocks that are not excluded (u,)."""
-        influence = self.compare(*self.combine(excluded), ~excluded)
+        influence = self.compare(self.combine(excluded), ~excluded)
         inside, scale = (influence.degrees > 0) & ~excluded, 1.0
         if inside.any():
             distance, degrees = np.sqrt(influence.distance[inside]), influence.degrees[inside]
@@ -76,36 +108,48 @@ class HeldOutBlocks(NamedTuple):
             scale = max(1.0, estimate_scale_of(distance[middle], degrees[middle].astype(float)))
         return PartialFit(excluded, influence, scale, 0)
 
-    def compare(self, triangle: FloatArray, y: FloatArray, inside: BoolArray) -> Influence:
-        """Return the influence of every block for the factor (k, k) and solution (k,) of the blocks
-        that are `inside` (u,), and of others.
+    def compare(self, prediction: Prediction, inside: BoolArray) -> Influence:
+        """Return the influence of every block for a prediction by the blocks that are `inside`
+        (u,), and of others.
         """
-        influence = make_empty_influence(len(self.poses))
-        for numbers, H, residual, present in self.groups:
-            half = H
-            if H.size:  # one system for all blocks
-                stacked = H.reshape(-1, H.shape[2]).T
-                half = substitute_transposed(triangle, stacked).T.reshape(H.shape)
+        influence, (done, triangle, y) = make_empty_influence(len(self.poses)), prediction
+        for structure, numbers, nodes, rows, r, present in self.groups:
+            w = rows.shape[2] - self.shared
+            own, half, at_best = rows[..., :w], rows[..., w:], r
+            if done is not None and structure >= 0:
+                path, root, slope = done.at_nodes(nodes)
+                half = half + own @ slope
+                at_best = r + (own @ done.shift[0, path][..., None])[..., 0]
+                own = own @ root
+            at_best = at_best + half @ y
+            if half.size:  # one system for all blocks
+                stacked = half.reshape(-1, half.shape[2]).T
+                half = substitute_transposed(triangle, stacked).T.reshape(half.shape)
+            half = np.concatenate([own, half], axis=2)
             weight = inside[numbers].astype(np.float64)
-            tested = compute_block_influence(half, residual + H @ y, present, weight)
-            influence.fill(numbers, tested)
+            influence.fill(numbers, compute_block_influence(half, at_best, present, weight))
         return influence
 
-    def combine(self, excluded: BoolArray) -> tuple[FloatArray, FloatArray]:
-        """Return the factor R (k, k) and solution y (k,) of the blocks that are not excluded."""
-        k = self.groups[0][1].shape[2]
-        count = 0
-        stacked: list[FloatArray] = [np.column_stack([np.eye(k), np.zeros(k)])]
-        for numbers, H, residual, _ in self.groups:
+    def combine(self, excluded: BoolArray) -> Prediction:
+        """Return the prediction by the blocks that are not excluded."""
+        k, factors = self.shared, NodeFactors(self.tree, 1, self.shared)
+        for i, structure in enumerate(self.tree.structures):  # of variance 1
+            n, u = structure.unknowns.shape
+            unit = np.eye(u, structure.width + k + 1)
+            factors.add(i, np.tile(unit, (n, 1))[None], np.repeat(np.arange(n), u))
+        factor = np.eye(k + 1)[None]
+        factor[0, k, k] = 0.0
+        for structure, numbers, nodes, rows, residual, _ in self.groups:
             kept = ~excluded[numbers]
-            rows = np.concatenate([H[kept], residual[kept][..., None]], axis=2)
-            stacked.append(rows.reshape(-1, k + 1))
-            count += len(stacked[-1])
-            if count > FOLDED:
-                stacked, count = [np.asarray(np.linalg.qr(np.concatenate(stacked), mode="r"))], 0
-        triangle = np.asarray(np.linalg.qr(np.concatenate(stacked), mode="r"))
-        R = triangle[:k, :k]
-        return R, -substitute_backward(R, triangle[:k, k])
+            all_rows = np.concatenate([rows[kept], residual[kept][..., None]], axis=2)
+            part = NodeRows(structure, nodes[kept], numbers[kept], all_rows[None])
+            factor = fold_node_rows(factor, factors, [part] if kept.any() else [])
+        done = None
+        if self.tree.structures:
+            done, rest = eliminate_tree(factors)
+            factor = engine.fold(factor, rest)
+        R = factor[0, :k, :k]
+        return Prediction(done, R, -substitute_backward(R, factor[0, :k, k]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,21 +162,21 @@ class HeldOutCheck:
     suspects: IntArray
 
     @cached_property
-    def prediction(self) -> tuple[FloatArray, FloatArray]:
-        """Factor and solution of all blocks that do fit."""
+    def prediction(self) -> Prediction:
+        """The prediction by all blocks that do fit."""
         return self.blocks.combine(self.search.end.excluded)
 
     def p_values(self, data: Measurements) -> FloatArray:
         """Return the probability of a larger distance, of each block (b,) of other values of some
         of these poses: against the prediction by all blocks that do fit.
         """
-        other = self.predictor.make_blocks(data)
+        other = self.predictor.make_blocks(data, self.blocks.tree)
         outside = np.zeros(len(other.poses), dtype=bool)
-        tested = other.compare(*self.prediction, outside)
+        tested = other.compare(self.prediction, outside)
         tail = compute_chi_square_tail(tested.degrees, tested.distance / self.search.end.scale**2)
         has_rows = np.zeros(len(other.poses), dtype=bool)
-        for numbers, *_ in other.groups:
-            has_rows[numbers] = True
+        for group in other.groups:
+            has_rows[group.blocks] = True
         return np.where(has_rows & (tested.degrees < 1), np.nan, tail)
 
 
@@ -146,28 +190,34 @@ class Predictor(NamedTuple):
     uncertainty: FitUncertainty | None
     unknown: tuple[str, ...]
 
-    def make_blocks(self, data: Measurements) -> HeldOutBlocks:
-        """Return the rows of measurements with what predicts them."""
+    def make_blocks(self, data: Measurements, tree: EliminationTree | None = None) -> HeldOutBlocks:
+        """Return the rows of measurements with what predicts them, in a tree of the same
+        variables; by default in one of their own.
+        """
         data = fill_in_reading_sigma(self.robot, data)
-        by_y = self.predict(data)
+        table = data.nuisance_parameters.table
         member = np.unique(linked_blocks(data), return_inverse=True)[1]
         poses = list_block_labels(data.labels, member)
-        groups = []
-        for blocks, columns, r in self.iterate_rows(data, member):
-            present = np.any(columns != 0.0, axis=2) | (r != 0.0)
-            parts = []
-            for few in np.array_split(columns, -(-len(columns) // TOGETHER)):
-                used = few.any(axis=(0, 1))  # those of their sessions
-                parts.append(few[..., used] @ by_y[used])
-            groups.append((blocks, np.concatenate(parts), r, present))
-        return HeldOutBlocks(poses, member, tuple(groups))
+        by_shared = self._predict(table.names)
+        variables, root = self._list_own(table.names, table.dimensions)
+        parts = []
+        for blocks, unknowns, columns, r in self._iterate_blocks(data, member):
+            present, c = np.any(columns != 0.0, axis=2) | (r != 0.0), unknowns.shape[1]
+            own, machine = columns[..., :c], columns[..., c:]
+            used = np.where(unknowns[..., None] >= 0, variables[unknowns], -1)
+            moved, to_own = join_columns(used, root[unknowns])
+            shared = own @ by_shared[unknowns] + machine @ by_shared[len(table.names) :]
+            parts.append((blocks, moved, own @ to_own, shared, r, present))
+        if tree is None:
+            tree = _build_tree([moved for _, moved, *_ in parts], self._count_own())
+        groups = [group for part in parts for group in _divide(tree, *part)]
+        return HeldOutBlocks(poses, member, tuple(groups), tree, by_shared.shape[1])
 
-    def iterate_rows(
+    def _iterate_blocks(
         self, data: Measurements, member: IntArray
-    ) -> Iterator[tuple[IntArray, FloatArray, FloatArray]]:
-        """Yield blocks (b,) of equal size with their derivatives (b, m, U + p + e) by nuisance
-        parameters, free parameters and errors of a model discrepancy, and residuals (b, m), in
-        standard deviations of the noise; `member` (n,) is the block of each pose.
+    ) -> Iterator[tuple[IntArray, IntArray, FloatArray, FloatArray]]:
+        """Yield blocks as `iterate_blocks`, in standard deviations of the noise; `member` (n,) is
+        the block of each pose.
         """
         if self.uncertainty is None:
             nothing = np.zeros(0)
@@ -179,36 +229,117 @@ class Predictor(NamedTuple):
         values = np.array([[self.values[name] for name in table.names]]).reshape(1, -1)
         total = problem.poses.count_rows(member, int(member.max(initial=-1)) + 1)
         noise = 1.0 if self.uncertainty is None else self.uncertainty.noise_scale
-        for blocks, columns, r in iterate_blocks(problem.rows_at(z, values), member, total):
-            yield blocks, columns / noise, r / noise
+        for *names, columns, r in iterate_blocks(problem.rows_at(z, values), member, total):
+            yield *names, columns / noise, r / noise
+
+    def iterate_rows(
+        self, data: Measurements, member: IntArray
+    ) -> Iterator[tuple[IntArray, FloatArray, FloatArray]]:
+        """Yield blocks (b,) of equal size with their derivatives (b, m, U + p + e) by nuisance
+        parameters, free parameters and errors of a model discrepancy, and residuals (b, m), in
+        standard deviations of the noise; `member` (n,) is the block of each pose.
+        """
+        U = len(data.nuisance_parameters)
+        for blocks, unknowns, columns, r in self._iterate_blocks(data, member):
+            c, m = unknowns.shape[1], columns.shape[1]
+            whole = np.zeros((len(blocks), m, U + 1 + columns.shape[2] - c))
+            places = np.broadcast_to(np.where(unknowns < 0, U, unknowns)[:, None], (*r.shape, c))
+            np.put_along_axis(whole, places, columns[..., :c], axis=2)
+            whole[..., U + 1 :] = columns[..., c:]
+            yield blocks, np.delete(whole, U, axis=2), r
 
     def predict(self, data: Measurements) -> FloatArray:
         """Return the derivative (U + p + m, k) of nuisance parameters of data, free parameters and
-        the errors of a model discrepancy by y.
+        the errors of a model discrepancy by independent standard normal variables.
         """
         table = data.nuisance_parameters.table
-        names, dimensions = table.names, table.dimensions
+        shared = self._predict(table.names)
+        variables, root = self._list_own(table.names, table.dimensions)
+        own = np.zeros((len(shared), self._count_own() + 1))
+        np.put_along_axis(own[: len(table)], variables, root, axis=1)  # -1 is the last
+        return np.concatenate([shared, own[:, :-1]], axis=1)
+
+    def _count_own(self) -> int:
+        """Return the number of variables that move nuisance parameters at a known machine."""
+        fit = self.uncertainty
+        return len(self.unknown) + (0 if fit is None else fit.root.shape[1])
+
+    def _predict(self, names: tuple[str, ...]) -> FloatArray:
+        """Return the derivative (U + p + m, p + m) of nuisance parameters, free parameters and the
+        errors of a model discrepancy by the variables that these have in common.
+        """
         fit, U = self.uncertainty, len(names)
-        p, w = (0, 0) if fit is None else (len(fit.posterior.unit), fit.root.shape[1])
-        own = None if fit is None else fit.posterior.discrepancy
+        if fit is None:
+            return np.zeros((U, 0))
+        p, own = len(fit.posterior.unit), fit.posterior.discrepancy
         m = 0 if own is None else own.errors.count
-        by_y = np.zeros((U + p + m, p + w + len(self.unknown) + m))
-        if fit is not None:
-            spread = fit.spread
-            by_y[U : U + p, :p] = spread / fit.posterior.unit[:, None]
-            if own is not None:  # parameters follow the errors, which predictions lack
-                by_y[U : U + p, -m:] = own.root / fit.posterior.unit[:, None]
-                by_y[U + p :, -m:] = -np.eye(m)
-            follow, places = fit.slope @ spread, {name: i for i, name in enumerate(fit.names)}
-            for i, name in enumerate(names):
-                if name in self.kept and name in places:
-                    by_y[i, :p] = follow[places[name]]
-                    by_y[i, p : p + w] = fit.root[places[name]]
+        by_y, spread = np.zeros((U + p + m, p + m)), fit.spread
+        by_y[U : U + p, :p] = spread / fit.posterior.unit[:, None]
+        if own is not None:  # parameters follow the errors, which predictions lack
+            by_y[U : U + p, p:] = own.root / fit.posterior.unit[:, None]
+            by_y[U + p :, p:] = -np.eye(m)
+        follow, places = fit.slope @ spread, {name: i for i, name in enumerate(fit.names)}
         for i, name in enumerate(names):
-            if name in self.unknown:
-                unit = self.robot.size if dimensions[i] is Dimension.LENGTH else 1.0
-                by_y[i, p + w + self.unknown.index(name)] = ANYWHERE * unit
+            if name in self.kept and name in places:
+                by_y[i, :p] = follow[places[name]]
         return by_y
+
+    def _list_own(
+        self, names: tuple[str, ...], dimensions: tuple[Dimension, ...]
+    ) -> tuple[IntArray, FloatArray]:
+        """Return the numbers (U, e) of the other variables that move each nuisance parameter at a
+        known machine, -1 for none, and the derivatives (U, e) by these.
+        """
+        fit, listed = self.uncertainty, []
+        places = {} if fit is None else {name: i for i, name in enumerate(fit.names)}
+        for name, dimension in zip(names, dimensions, strict=True):
+            row, first = np.zeros(0), 0 if fit is None else fit.root.shape[1]
+            if fit is not None and name in self.kept and name in places:
+                row, first = fit.root[places[name]], 0
+            elif name in self.unknown:
+                unit = self.robot.size if dimension is Dimension.LENGTH else 1.0
+                row, first = np.array([ANYWHERE * unit]), first + self.unknown.index(name)
+            used = np.flatnonzero(row)
+            listed.append((first + used, row[used]))
+        widest = max((len(used) for used, _ in listed), default=0)
+        numbers, root = np.full((len(names), widest), -1), np.zeros((len(names), widest))
+        for i, (used, row) in enumerate(listed):
+            numbers[i, : len(used)], root[i, : len(used)] = used, row
+        return numbers, root
+
+
+def _build_tree(moved: Sequence[IntArray], count: int) -> EliminationTree:
+    """Return the elimination tree of variables, those (b, n) that blocks have together in a node;
+    -1 for none.
+    """
+    sets, first, is_used = [np.zeros((0, 2), dtype=np.int64)], 0, np.zeros(count, dtype=bool)
+    for of_blocks in moved:
+        number = first + np.arange(len(of_blocks))[:, None] + np.zeros_like(of_blocks)
+        sets.append(np.column_stack([number[of_blocks >= 0], of_blocks[of_blocks >= 0]]))
+        is_used[sets[-1][:, 1]] = True
+        first += len(of_blocks)
+    return build_tree(is_used, ["session"] * count, np.concatenate(sets))
+
+
+def _divide(
+    tree: EliminationTree, blocks: IntArray, moved: IntArray, rows: FloatArray,
+    shared: FloatArray, residual: FloatArray, present: BoolArray,
+) -> list[BlockRows]:  # fmt: skip
+    """Return the rows of blocks by the structure of their nodes; arguments as in `make_blocks`."""
+    node = np.where(moved >= 0, tree.node[moved], -1).max(axis=1, initial=-1)
+    structure = np.where(node >= 0, tree.structure[node], -1) if len(tree.width) else node
+    groups = []
+    for s in find_distinct(structure).tolist():
+        own = structure == s
+        columns, width = moved[own], 0 if s < 0 else tree.structures[s].width
+        spread = np.zeros((*rows[own].shape[:2], width + 1))
+        if s >= 0:
+            places = np.where(columns >= 0, tree.columns(node[own], columns), width)
+            places = np.broadcast_to(places[:, None], rows[own].shape)
+            np.put_along_axis(spread, places, rows[own], axis=2)
+        both = np.concatenate([spread[..., :width], shared[own]], axis=2)
+        groups.append(BlockRows(s, blocks[own], node[own], both, residual[own], present[own]))
+    return groups
 
 
 def check_held_out_rows(

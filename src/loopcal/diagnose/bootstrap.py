@@ -79,7 +79,7 @@ def list_observed_values(linear: FitLinearization, clusters: Clusters) -> Observ
     z, trials, estimate = linearization.deviation, problem.trials, linearization.nuisance
     fixed = None if estimate is None else estimate.values
     solution = problem.poses.solve(z, trials, linearization.next_start, problem.control, fixed)
-    root = np.zeros((0, 0)) if estimate is None else estimate.elimination.joint_root()[0]
+    root = np.zeros((0, 0)) if estimate is None else estimate.elimination.joint_root()
     links = max(rows.poses_by_link.shape[1] for rows in problem.rows)
     parts, coordinates = [], []
     for block, poses in problem.poses.iterate_poses(solution, z):

@@ -175,7 +175,7 @@ def compute_robust_spread(linear: FitLinearization, clusters: Clusters) -> Robus
     for rows_of_block in linear.problem.leverage_rows(linear.linearization, linear.solution):
         for part in rows_of_block:
             member = clusters.member[part.poses]
-            rows, m = part.rows[member >= 0], part.rows.shape[1]
+            rows, m = part.spread(setup)[member >= 0], part.rows.shape[1]
             if rows.size:
                 places = np.repeat(member[member >= 0], m)
                 folded = fold_at(folded, rows.reshape(1, -1, width), places)

@@ -251,7 +251,7 @@ def score_leave_one_out(
         problem.poses.count_rows(member, len(blocks)),
         problem.leverage_rows(linearization),
     )
-    for numbers, A, r in iterate_blocks(rows, member, count):
+    for numbers, _, A, r in iterate_blocks(rows, member, count):
         B = A @ d.directions[0]  # (blocks, m, p)
         residual = A @ z[0] - r - np.moveaxis(B @ y.T, -1, 0)
         H = np.matmul(B * weight[:, None, None, :], B.swapaxes(-1, -2))

@@ -23,7 +23,6 @@ from loopcal.diagnose.residual_patterns import (
     ResidualRows,
     order_by_time,
     scale_to_range,
-    span_columns,
     test_effect,
 )
 from loopcal.estimate.fit_linearization import FitLinearization
@@ -32,6 +31,7 @@ from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
 from loopcal.measure.measurements import Measurements
 from loopcal.mechanism.sensitivity import differentiate_pose
+from loopcal.numerics.split_columns import SplitColumns, span_columns
 from loopcal.numerics.statistics import find_distinct
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension
@@ -154,7 +154,7 @@ def _measure_backlash(
     known, effect = rows.with_effects(along.columns), travel.columns
     if test_effect(known, travel) > DOUBTED:
         return np.zeros(len(unit)), []
-    if span_columns(known.project(effect)).shape[1] < len(unit):
+    if span_columns(SplitColumns.of(known.project(effect))).shape[1] < len(unit):
         return np.zeros(len(unit)), []
     half, *_ = np.linalg.lstsq(known.project(effect), known.residual, rcond=None)
     largest = int(np.argmax(np.abs(half)))

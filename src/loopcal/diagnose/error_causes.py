@@ -171,7 +171,7 @@ def measure_wrong_poses(remainder: Remainder, pose: IntArray, known: float) -> f
     total, evidence = 0.0, [-np.inf]
     for k in range(1, min(max(int(OUTLYING * len(names)), 1), MOST_WRONG) + 1):
         square = float(remainder.residual @ remainder.weigh(remainder.residual))
-        P = remainder.taken[member] * is_row[..., None]
+        P = remainder.taken.toarray()[member] * is_row[..., None]
         own = remainder.weigh(remainder.residual)[member] * is_row
         w, vectors = np.linalg.eigh(
             is_row[:, None] * np.eye(member.shape[1]) - P @ P.swapaxes(1, 2)

@@ -105,7 +105,7 @@ def compute_influence(
     results = [make_empty_influence(u) for _ in fits]
     total = problem.poses.count_rows(member, u)
     rows = problem.leverage_rows(linearization, solution)
-    for blocks, columns, r in iterate_blocks(rows, member, total):
+    for blocks, _, columns, r in iterate_blocks(rows, member, total):
         # nuisance parameters come first, in units of their standard deviation
         A, nuisance = columns[..., -p:], columns[..., :-p]
         present = np.any(A != 0.0, axis=2) | np.any(nuisance != 0.0, axis=2) | (r != 0.0)
@@ -147,31 +147,72 @@ def compute_block_influence(
 
 def iterate_blocks(
     rows_of_problem: Iterable[list[LeverageRows]], member: IntArray, total: IntArray
-) -> Iterator[tuple[IntArray, FloatArray, FloatArray]]:
-    """Yield blocks of equal size together: numbers (b,), matrices (b, m, p), residuals (b, m).
+) -> Iterator[tuple[IntArray, IntArray, FloatArray, FloatArray]]:
+    """Yield blocks of equal size together: numbers (b,), the nuisance parameters (b, c) that they
+    move, -1 for none, matrices (b, m, c + p) by these and the machine, and residuals (b, m).
 
     A block whose rows come with several chunks of poses waits until the last of them. `total` (u,)
     is the number of rows of each block, see `PoseRows.count_rows`.
     """
-    waiting: list[tuple[IntArray, FloatArray]] = []
+    waiting: list[tuple[IntArray, IntArray, FloatArray, FloatArray]] = []
     for rows_of_block in rows_of_problem:
         for rows in rows_of_block:
-            blocks = np.repeat(member[rows.poses], rows.rows.shape[1])
-            waiting.append((blocks, rows.rows.reshape(-1, rows.rows.shape[2])))
+            (k, m), w = rows.rows.shape[:2], rows.unknowns.shape[1]
+            blocks = np.repeat(member[rows.poses], m)
+            flat = rows.rows.reshape(k * m, -1)
+            waiting.append((blocks, rows.unknowns.repeat(m, axis=0), flat[:, :w], flat[:, w:]))
         if not waiting:
             continue
-        block_of_row = np.concatenate([w[0] for w in waiting])
-        stacked = np.concatenate([w[1] for w in waiting])
+        width = max(of_part.shape[1] for _, of_part, *_ in waiting)
+        block_of_row, unknowns, moved, machine = (
+            np.concatenate(arrays)
+            for arrays in zip(*(_widen(part, width) for part in waiting), strict=True)
+        )
         order = np.argsort(block_of_row, kind="stable")
-        block_of_row, stacked = block_of_row[order], stacked[order]
+        block_of_row = block_of_row[order]
         numbers, first, sizes = np.unique(block_of_row, return_index=True, return_counts=True)
         complete = sizes == total[numbers]
         for size in find_distinct(sizes[complete]):
             chosen = complete & (sizes == size)
-            places = first[chosen][:, None] + np.arange(size)
-            yield numbers[chosen], stacked[places, :-1], stacked[places, -1]
-        left = np.repeat(~complete, sizes)
-        waiting = [(block_of_row[left], stacked[left])] if left.any() else []
+            places = order[first[chosen][:, None] + np.arange(size)]
+            own, columns = join_columns(unknowns[places], moved[places])
+            rest = machine[places]
+            columns = np.concatenate([columns, rest[..., :-1]], axis=2)
+            yield numbers[chosen], own, columns, rest[..., -1]
+        is_left = np.repeat(~complete, sizes)
+        left = order[is_left]
+        waiting = [(block_of_row[is_left], unknowns[left], moved[left], machine[left])]
+        waiting = waiting if left.size else []
+
+
+def _widen(
+    part: tuple[IntArray, IntArray, FloatArray, FloatArray], width: int
+) -> tuple[IntArray, IntArray, FloatArray, FloatArray]:
+    """Return rows whose columns by nuisance parameters (n, w) are as many as `width`."""
+    blocks, unknowns, moved, machine = part
+    more = (0, 0), (0, width - unknowns.shape[1])
+    return blocks, np.pad(unknowns, more, constant_values=-1), np.pad(moved, more), machine
+
+
+def join_columns(unknowns: IntArray, moved: FloatArray) -> tuple[IntArray, FloatArray]:
+    """Return the distinct nuisance parameters (b, c) of the rows of each block, and the rows
+    (b, m, c) by them, from rows (b, m, w) by `unknowns` (b, m, w).
+    """
+    b, m, w = unknowns.shape
+    if not m * w or (unknowns == unknowns[:, :1]).all():
+        return unknowns.reshape(b, m * w)[:, :w], moved
+    flat = unknowns.reshape(b, m * w)
+    order = np.argsort(flat, axis=1, kind="stable")
+    ordered = np.take_along_axis(flat, order, axis=1)
+    number = np.zeros_like(flat)
+    number[:, 1:] = np.cumsum(ordered[:, 1:] != ordered[:, :-1], axis=1)
+    place = np.empty_like(flat)
+    np.put_along_axis(place, order, number, axis=1)
+    c = int(number.max()) + 1
+    own, columns = np.full((b, c), -1), np.zeros((b, m, c))
+    np.put_along_axis(own, number, ordered, axis=1)
+    np.put_along_axis(columns, place.reshape(b, m, w), moved, axis=2)
+    return own, columns
 
 
 MOST_ROUNDS = 20  # largest number of searches with other suspects

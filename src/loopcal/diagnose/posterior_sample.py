@@ -135,7 +135,7 @@ def describe_density(linear: FitLinearization) -> PosteriorDensity:
     setup_root, rank = np.zeros((0, 0)), 0
     nuisance = linear.linearization.nuisance
     if nuisance is not None:
-        joint = scale * nuisance.elimination.joint_root()[0]
+        joint = scale * nuisance.elimination.joint_root()
         setup_root = joint[:, (joint != 0.0).any(axis=0)]
         rank = int(nuisance.elimination.rank[0])
     prior = None if fit.options.prior is None else fit.options.prior.added(linear.problem)

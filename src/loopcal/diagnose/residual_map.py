@@ -22,6 +22,7 @@ from loopcal.diagnose.residual_patterns import collect_residual_rows, collect_ro
 from loopcal.estimate.fit_linearization import FitLinearization, linearize_smooth_errors
 from loopcal.estimate.residual_test import coverage_factor
 from loopcal.estimate.smooth_errors import SmoothErrors
+from loopcal.numerics.split_columns import SplitColumns
 from loopcal.typing import FloatArray, IntArray
 
 FEWEST_REGIONS = 8  # of which each is left out
@@ -57,12 +58,12 @@ def check_map(
     if rows is None or len(T) != linear.data.n_poses:
         return untested
     regions = errors.group_regions(T, FEWEST_REGIONS)[rows.locate_poses(linear.data)]
-    extended = np.hstack([rows.basis, collect_columns(linear, errors)])
-    free = rows.basis.shape[1]
-    penalty = np.where(np.arange(extended.shape[1]) < free, 0.0, noise)
+    columns = rows.basis.remove(rows.basis.remove(collect_columns(linear, errors)))
+    s, axes = np.linalg.eigh(columns.T @ columns)
+    by_errors = columns @ (axes / np.sqrt(np.maximum(s, 0.0) + noise))
     left = [
-        _leave_out(extended[:, :count], penalty[:count], rows.residual, regions)
-        for count in (free, len(penalty))
+        _leave_out(each, rows.residual, regions)
+        for each in (rows.basis, rows.basis.append(by_errors))
     ]
     known = np.isfinite(left).all(axis=0)
     if known.sum() < FEWEST_REGIONS:
@@ -79,20 +80,18 @@ def collect_columns(linear: FitLinearization, errors: SmoothErrors) -> FloatArra
     """Return the columns (R, m) of smooth errors in the rows of a fit of exact readings."""
     stacked = collect_rows(linear.data, *linearize_smooth_errors(linear, errors))
     assert stacked is not None
-    return stacked.rows[:, -errors.count - 1 : -1]
+    return stacked.columns.wide[:, -errors.count :]
 
 
-def _leave_out(
-    X: FloatArray, penalty: FloatArray, residual: FloatArray, regions: IntArray
-) -> FloatArray:
-    """Return the sum of squares of the rows of each region by ridge regression on the columns X
-    (R, k) of the others; NaN where these do not predict it.
+def _leave_out(X: SplitColumns, residual: FloatArray, regions: IntArray) -> FloatArray:
+    """Return the sum of squares of the rows of each region by regression on the others, with
+    H = X X', X (R, k); NaN where these do not predict it.
     """
-    gain = np.linalg.solve(X.T @ X + np.diag(penalty), X.T)
-    left, squares = residual - X @ (gain @ residual), np.full(regions.max() + 1, np.nan)
+    left, squares = X.remove(residual), np.full(regions.max() + 1, np.nan)
     for region in range(len(squares)):
-        own = regions == region
-        rest = np.eye(own.sum()) - X[own] @ gain[:, own]
-        if own.any() and np.linalg.eigvalsh(rest)[0] > DETERMINED:
+        own = np.flatnonzero(regions == region)
+        part = X.take(own).toarray()
+        rest = np.eye(len(own)) - part @ part.T
+        if own.size and np.linalg.eigvalsh(rest)[0] > DETERMINED:
             squares[region] = float((np.linalg.solve(rest, left[own]) ** 2).sum())
     return squares

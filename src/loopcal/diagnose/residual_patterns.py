@@ -36,7 +36,8 @@ from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations
 from loopcal.mechanism.model import Mechanism
 from loopcal.numerics.distributions import beta_probability
-from loopcal.numerics.elimination import find_connected_groups
+from loopcal.numerics.elimination import TreeElimination
+from loopcal.numerics.split_columns import EXPLAINED, SplitColumns, span_columns, split_columns
 from loopcal.numerics.statistics import (
     Remainder,
     VarianceComponent,
@@ -47,20 +48,38 @@ from loopcal.numerics.statistics import (
 from loopcal.typing import FloatArray, IntArray
 from loopcal.units import Dimension
 
-EXPLAINED = 1e-6  # share of its length below which a column counts as explained by other columns
+
+class FitRoot(NamedTuple):
+    """How independent variables move the estimate, and the setup at a known machine [SI].
+
+    machine : (p, k) by those of the machine. setup : (s,) the setup parameters in whose place the
+    others are. elimination : of the U setup parameters; None without any.
+    """
+
+    machine: FloatArray
+    setup: IntArray
+    elimination: TreeElimination | None
+
+    def times(self, x: FloatArray) -> FloatArray:
+        """Return what variables x (s + k, c) do (p + U, c)."""
+        s, done = len(self.setup), self.elimination
+        moved = np.zeros((0 if done is None else done.shift.shape[1], x.shape[1]))
+        moved[self.setup] = x[:s]
+        own = moved if done is None else done.move_unknowns(moved)
+        return np.concatenate([self.machine @ x[s:], own])
 
 
 @dataclass(frozen=True, eq=False)
 class ResidualRows:
     """R whitened rows of a fit, those of one series (a kind and its column) in order."""
 
-    basis: FloatArray  # (R, q) orthonormal, what is estimated
+    basis: SplitColumns  # (R, q) orthonormal, what is estimated
     residual: FloatArray  # (R,) of the least-squares fit
-    # (R, k) change of the k directions of the fit, and of the setup, by an error of each row
-    gain: FloatArray
-    # (p + U, k) these directions [SI]: an error e of the rows changes the estimate, and the setup
-    # at a known machine, by root gain' e, up to its sign
-    root: FloatArray
+    # (R, s + k) change of the variables of the setup, and of the k directions of the fit, by an
+    # error of each row: an error e of the rows changes the estimate, and the setup at a known
+    # machine, by root gain' e, up to its sign
+    gain: SplitColumns
+    root: FitRoot
     # kind, row, column: (R,) number of the kind, of its row, and of its residual
     kind: IntArray
     row: IntArray
@@ -84,28 +103,30 @@ class ResidualRows:
 
     def project(self, columns: FloatArray) -> FloatArray:
         """Return the part of columns (R, c) that nothing estimated explains; 0 for rounding."""
-        left = columns - self.basis @ (self.basis.T @ columns)
-        left -= self.basis @ (self.basis.T @ left)  # the first projection leaves rounding
+        left = self.basis.remove(self.basis.remove(columns))  # the first one leaves rounding
         size = np.linalg.norm(columns, axis=0)
         return np.where(np.linalg.norm(left, axis=0) > EXPLAINED * size, left, 0.0)
 
     def with_effects(self, columns: FloatArray) -> ResidualRows:
         """Return the rows as if the fit had also estimated effects with these columns (R, c)."""
-        new = span_columns(self.project(columns))
-        left = self.residual - new @ (new.T @ self.residual)
-        return replace(self, basis=np.concatenate([self.basis, new], axis=1), residual=left)
+        new = span_columns(SplitColumns.of(self.project(columns)))
+        return replace(self, basis=self.basis.append(new.wide), residual=new.remove(self.residual))
+
+    def move(self, errors: FloatArray) -> FloatArray:
+        """Return the change (p + U, c) [SI] of the estimate, and of the setup at a known machine,
+        by errors (R, c) of the rows.
+        """
+        return self.root.times(self.gain.products(errors))
 
     def without(self, rows: IntArray) -> ResidualRows:
         """Return the rows as if the fit had not used some of them (w,)."""
-        kept = np.ones(len(self.residual), dtype=bool)
-        kept[rows] = False
-        basis = span_columns(self.basis[kept])
-        left = self.residual[kept] - basis @ (basis.T @ self.residual[kept])
+        kept = np.delete(np.arange(len(self.residual)), rows)
+        basis = span_columns(self.basis.take(kept))
         return replace(
             self,
             basis=basis,
-            residual=left,
-            gain=self.gain[kept],
+            residual=basis.remove(self.residual[kept]),
+            gain=self.gain.take(kept),
             kind=self.kind[kept],
             row=self.row[kept],
             column=self.column[kept],
@@ -130,52 +151,6 @@ class ResidualRows:
             own = self.kind == number
             pose[own] = o.rows.reshape(len(o), -1)[self.row[own], 0]
         return pose
-
-
-def span_columns(columns: FloatArray) -> FloatArray:
-    """Return an orthonormal basis (R, q) of columns (R, c), each scaled to length one.
-
-    Columns without values in common rows, such as those of different sessions, are decomposed on
-    their own, and columns with values in most rows after all others: what is left of them.
-    """
-    length = np.linalg.norm(columns, axis=0)
-    scaled = columns[:, length > 0.0] / length[length > 0.0]
-    is_used = scaled != 0.0
-    is_wide = 2 * is_used.sum(axis=0) > len(scaled)
-    if is_wide.all():
-        return _decompose_columns(scaled)
-    narrow, wide = scaled[:, ~is_wide], scaled[:, is_wide]
-    row, column = np.nonzero(is_used[:, ~is_wide])
-    first = np.argmax(is_used[:, ~is_wide], axis=1)[row]
-    group = find_connected_groups(np.column_stack([first, column]), narrow.shape[1])
-    of_row = group[np.argmax(is_used[:, ~is_wide], axis=1)]
-    parts = []
-    for number in range(int(group.max()) + 1):
-        rows = np.flatnonzero((of_row == number) & is_used[:, ~is_wide].any(axis=1))
-        own = _decompose_columns(narrow[np.ix_(rows, np.flatnonzero(group == number))])
-        parts.append(np.zeros((len(scaled), own.shape[1])))
-        parts[-1][rows] = own
-    basis = np.concatenate(parts, axis=1)
-    left = wide - basis @ (basis.T @ wide)
-    left -= basis @ (basis.T @ left)  # the first projection leaves rounding
-    size = np.linalg.norm(left, axis=0)
-    left = left[:, size > EXPLAINED] / size[size > EXPLAINED]
-    return np.concatenate([basis, _decompose_columns(left)], axis=1)
-
-
-def _decompose_columns(scaled: FloatArray) -> FloatArray:
-    """Return an orthonormal basis (R, q) of columns (R, c) of length one."""
-    if not scaled.size:
-        return scaled
-    Q, R = np.linalg.qr(scaled)  # the triangle first: LAPACK divides and conquers many rows
-    try:
-        inner, s, _ = np.linalg.svd(R, full_matrices=False)
-    except np.linalg.LinAlgError:  # divide and conquer may fail; the slower driver does not
-        from scipy.linalg import svd
-
-        inner, s, _ = svd(R, full_matrices=False, lapack_driver="gesvd")
-    u = Q @ inner
-    return np.asarray(u[:, s > EXPLAINED])
 
 
 def linearize_examined(
@@ -206,7 +181,9 @@ def linearize_examined(
 class StackedRows(NamedTuple):
     """R rows of a problem, those of one series (a kind and its column) in order."""
 
-    rows: FloatArray  # (R, w) by setup, parameters and residual
+    setup: IntArray  # (s,) numbers of the setup parameters
+    columns: SplitColumns  # (R, s + p) by these and the parameters
+    residual: FloatArray  # (R,)
     kind: IntArray
     row: IntArray
     column: IntArray
@@ -218,22 +195,28 @@ def collect_rows(
 ) -> StackedRows | None:
     """Return the measured rows of a problem of exact readings; None without any."""
     observations = [rows for rows in data.observations if len(rows)]
-    groups: list[tuple[FloatArray, IntArray, IntArray, IntArray]] = []  # present rows
+    moved: list[tuple[FloatArray, IntArray]] = []  # present rows by setup parameters
+    groups: list[tuple[FloatArray, IntArray, IntArray, IntArray]] = []  # and by the others
     for node_rows in problem.leverage_rows(linearization, solution):
         for part in node_rows:
             present = np.diagonal(observations[part.kind].whitener, axis1=1, axis2=2) != 0.0
             i, column = np.nonzero(present[part.numbers])
-            kind = np.full(len(i), part.kind)
-            groups.append((part.rows[i, column], kind, part.numbers[i], column))
+            kind, w = np.full(len(i), part.kind), part.unknowns.shape[1]
+            rows = part.rows[i, column]
+            moved.append((rows[:, :w], part.unknowns[i]))
+            groups.append((rows[:, w:], kind, part.numbers[i], column))
     if not groups:
         return None
     rows, kind, row, column = (np.concatenate(arrays) for arrays in zip(*groups, strict=True))
+    columns, setup = split_columns(moved, 0 if problem.nuisance is None else len(problem.nuisance))
+    columns = columns.append(rows[:, :-1])
     first = np.cumsum([0, *(o.present.shape[1] for o in observations)])
     series = first[kind] + column
     place = np.concatenate([order_rows(o) for o in observations])
     start = np.cumsum([0, *(len(o) for o in observations)])
     order = np.lexsort((place[start[kind] + row], series))
-    return StackedRows(*(array[order] for array in (rows, kind, row, column, series)))
+    by_row = (rows[:, -1], kind, row, column, series)
+    return StackedRows(setup, columns.take(order), *(array[order] for array in by_row))
 
 
 def collect_residual_rows(linear: FitLinearization) -> ResidualRows | None:
@@ -245,23 +228,18 @@ def collect_residual_rows(linear: FitLinearization) -> ResidualRows | None:
     stacked = collect_rows(linear.data, linear.problem, linear.solution, linear.linearization)
     if stacked is None:
         return None
-    rows = stacked.rows
-    d, p = linear.decomposition, len(linear.fit.names)
-    used, determined = linear.is_estimated, d.used[0]
-    by_direction = rows[:, -p - 1 : -1] @ d.directions[0]
+    d, wide, setup = linear.decomposition, stacked.columns.wide, linear.linearization.nuisance
+    used, determined, p = linear.is_estimated, d.used[0], len(linear.fit.names)
+    of_setup, by_direction = wide[:, :-p], wide[:, -p:] @ d.directions[0]
     machine = by_direction[:, determined] / d.singular_values[0][determined]
-    basis = span_columns(np.concatenate([rows[:, : -p - 1], machine], axis=1))
-    residual = rows[:, -1] - basis @ (basis.T @ rows[:, -1])
-    machine_gain = by_direction[:, used] / linear.information[used]
-    machine_root = linear.fit.tolerance[:, None] * d.directions[0][:, used]
-    setup = linear.linearization.nuisance
-    setup_root = np.zeros((0, 0)) if setup is None else setup.elimination.joint_root()[0]
-    n, k = len(setup_root), machine_root.shape[1]
+    basis = span_columns(replace(stacked.columns, wide=np.concatenate([of_setup, machine], axis=1)))
+    gain = np.concatenate([of_setup, by_direction[:, used] / linear.information[used]], axis=1)
+    root = linear.fit.tolerance[:, None] * d.directions[0][:, used]
     return ResidualRows(
         basis=basis,
-        residual=residual,
-        gain=np.concatenate([machine_gain, rows[:, : -p - 1]], axis=1),
-        root=np.block([[machine_root, np.zeros((p, n))], [np.zeros((n, k)), setup_root]]),
+        residual=basis.remove(stacked.residual),
+        gain=replace(stacked.columns, wide=gain),
+        root=FitRoot(root, stacked.setup, setup and setup.elimination),
         kind=stacked.kind,
         row=stacked.row,
         column=stacked.column,
@@ -308,7 +286,6 @@ SESSION, BLOCK, POSE, TARGET, WALK = "session", "block", "pose", "target", "walk
 SMOOTH, ROUGH = "smooth", "rough"
 RANDOM = {SESSION, BLOCK, POSE, TARGET, WALK, SMOOTH, ROUGH}  # whose sizes are drawn
 CAUSE = "residuals.cause"  # code of the finding on the cause of residuals
-CHUNK = 32  # columns that are multiplied together
 MOST_POSES = 100  # poses that show an effect well enough, evenly chosen of more
 MOST_VALUES, FEWEST_POSES = 6000, 30  # values of these, and poses that they need at least
 EXAMINED = 120_000  # residuals that are examined at most: more would show the same
@@ -427,7 +404,8 @@ def list_shared_errors(
     x = np.column_stack([np.ones(len(place)), place])
     products = np.column_stack([x[:, i] * x[:, j] for i in range(4) for j in range(i, 4)])
     # orthonormal over the poses, the constant first
-    root = span_columns(products - products.mean(axis=0)) * np.sqrt(len(place))
+    root = span_columns(SplitColumns.of(products - products.mean(axis=0))).wide
+    root = root * np.sqrt(len(place))
     steps = [choose_evenly(len(o), MOST_POSES)[1:] for o in observations]
     listed = [
         (SMOOTH, [root[i] for i in poses]),
@@ -573,18 +551,12 @@ def test_correlation(rows: ResidualRows) -> tuple[float, float]:
     nu = rows.degrees
     if len(pairs) == 0 or nu < FEWEST_LEFT:
         return np.nan, np.nan
-    r, U = rows.residual, rows.basis
-    observed = float(r[pairs] @ r[pairs + 1]) / rows.square
-    # L columns, L the symmetric matrix with 1/2 for each pair of neighbors
-    LU = np.zeros_like(U)
-    LU[pairs] += 0.5 * U[pairs + 1]
-    LU[pairs + 1] += 0.5 * U[pairs]
-    # traces of B = M L M, from tr L = 0 and tr L^2 = pairs / 2
-    first = -float((U * LU).sum())
-    second = 0.5 * len(pairs) - 2.0 * float((LU**2).sum())
-    for i in range(0, U.shape[1], CHUNK):  # most columns have values in the rows of one session
-        used = LU[:, i : i + CHUNK].any(axis=1)
-        second += float(((U[used].T @ LU[used, i : i + CHUNK]) ** 2).sum())
+    observed = float(rows.residual[pairs] @ rows.residual[pairs + 1]) / rows.square
+    # traces of B = M L M, L the symmetric matrix with 1/2 for each pair of neighbors, from tr L = 0
+    # and tr L^2 = pairs / 2
+    first, squared, product = rows.basis.trace_neighbors(pairs)
+    second = 0.5 * len(pairs) - 2.0 * squared + product
+    first = -first
     mean = first / nu
     variance = 2.0 * (second - first**2 / nu) / (nu * (nu + 2.0))
     if not variance > 0.0:
@@ -662,7 +634,7 @@ def _evaluate(
     from scipy.linalg import solve_triangular
 
     q, k = rows.basis.shape[1], rows.gain.shape[1]
-    columns = np.column_stack([rows.basis, rows.residual])
+    columns, gain = np.column_stack([rows.basis.toarray(), rows.residual]), rows.gain.toarray()
     log_det, white, spread = 0.0, [], np.zeros((k, k))
     for members in segments:
         count, n = members.shape
@@ -673,7 +645,7 @@ def _evaluate(
         # one system for all segments: the triangle is the same for each
         stacked = columns[members.T].reshape(n, count * (q + 1))
         white.append(solve_triangular(L, stacked, lower=True).reshape(n * count, q + 1))
-        part = (L.T @ rows.gain[members.T].reshape(n, count * k)).reshape(n * count, k)
+        part = (L.T @ gain[members.T].reshape(n, count * k)).reshape(n * count, k)
         spread += part.T @ part
     R = np.asarray(np.linalg.qr(np.concatenate(white), mode="r"))
     log_det += 2.0 * float(np.log(np.abs(np.diag(R)[:q])).sum())

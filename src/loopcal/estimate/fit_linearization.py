@@ -35,6 +35,7 @@ from loopcal.estimate.problem import Problem, problem_of, spread_rows
 from loopcal.estimate.residual_test import NoiseKnowledge
 from loopcal.estimate.result import Identification
 from loopcal.estimate.smooth_errors import SmoothErrors
+from loopcal.measure.array_checks import drop_repeats, take_rows
 from loopcal.measure.measurements import Measurements
 from loopcal.mechanism.model import Mechanism
 from loopcal.numerics.decomposition import Decomposition
@@ -256,11 +257,13 @@ RowSources = Sequence[tuple[IntArray, FloatArray | None]]
 
 
 def find_share(parts: RowSources, source: int, rows: IntArray | slice = slice(None)) -> FloatArray:
-    """Return the roots (k, m, m) of a source in rows of a kind; (k, 1, 1) of whole rows."""
+    """Return the roots (k | 1, m, m) of a source in rows of a kind; (k | 1, 1, 1) of whole rows."""
     share = np.zeros((1, 1, 1))
     for numbers, root in parts:
         chosen = (numbers[rows] == source)[:, None, None]
-        share = share + (chosen if root is None else chosen * root[rows])
+        chosen = chosen[:1] if (chosen == chosen[:1]).all() else chosen
+        own = root if root is None or isinstance(rows, slice) else take_rows(root, rows)
+        share = share + (chosen if own is None else chosen * drop_repeats(own))
     return np.asarray(share)
 
 
@@ -294,32 +297,40 @@ def fold_sources(
         kinds = poses.linearize_kinds(block, linearized, problem.trials, fixed)
         for source in range(count):
             own = [
-                find_share(of, source, numbers)
+                np.broadcast_to(own, (len(numbers), *own.shape[1:]))
                 for of, numbers in zip(sources, block.row_numbers, strict=True)
+                for own in [find_share(of, source, numbers)]
             ]
             if not any(rows.any() for rows in own):
                 continue
             node_rows = _select_rows(poses, block, kinds, own)
             for part in spread_rows(poses, block, node_rows, p, at_nodes):
-                rows = part.rows.reshape(-1, part.rows.shape[2])[:, :-1]
-                for factor in divide_by_cluster(source, rows, p, estimate):
+                rows = part.rows[..., :-1]
+                for factor in divide_by_cluster(source, part.unknowns, rows, p, estimate):
                     key = source, int(factor.unknowns[0]) if len(factor.unknowns) else -1
                     folded[key] = _fold_together(folded.get(key), factor)
     return [folded[key] for key in sorted(folded)]
 
 
 def divide_by_cluster(
-    source: int, rows: FloatArray, p: int, estimate: EliminatedNuisance | None
+    source: int, moved: IntArray, rows: FloatArray, p: int, estimate: EliminatedNuisance | None
 ) -> list[SourceFactor]:
-    """Return rows (n, U + p) of a source by the clusters of setup parameters that they move."""
-    if estimate is None:
+    """Return rows (k, m, w + p) of a source, which move setup parameters (k, w), by the clusters of
+    these.
+    """
+    k, m, w = *rows.shape[:2], moved.shape[1]
+    if estimate is None or not w:
+        rows = rows.reshape(k * m, w + p)
         return [SourceFactor(source, np.zeros(0, dtype=np.int64), rows[:, :0], rows)]
-    cluster, moved = estimate.elimination.tree.cluster, rows[:, :-p] if p else rows
-    of_row = np.where(moved.any(axis=1), cluster[np.argmax(moved != 0.0, axis=1)], -1)
-    factors = []
-    for c in find_distinct(of_row):
-        own, unknowns = rows[of_row == c], np.flatnonzero((cluster == c) & (c >= 0))
-        factors.append(SourceFactor(source, unknowns, own[:, unknowns], own[:, len(cluster) :]))
+    cluster, factors = estimate.elimination.tree.cluster, []
+    for c in find_distinct(cluster[moved[:, 0]]):
+        chosen, unknowns = cluster[moved[:, 0]] == c, np.flatnonzero(cluster == c)
+        own = rows[chosen]
+        setup, places = np.zeros((*own.shape[:2], len(unknowns))), moved[chosen]
+        places = np.broadcast_to(np.searchsorted(unknowns, places)[:, None], own[..., :w].shape)
+        np.put_along_axis(setup, places, own[..., :w], axis=2)
+        flat = (each.reshape(len(own) * m, -1) for each in (setup, own[..., w:]))
+        factors.append(SourceFactor(source, unknowns, *flat))
     return factors
 
 

@@ -109,17 +109,28 @@ class Linearization(TrialBatch):
 class LeverageRows(NamedTuple):
     """Whitened rows by everything that they determine, poses eliminated.
 
-    poses : (k,) first pose of each set of rows.
-    rows : (k, m, U + p + 1). The first U columns, none without nuisance parameters, are in units of
-        the standard deviations of these; the next p are those of the machine as the nuisance
+    poses : (k,) first pose of each set of rows. unknowns : (k, w) nuisance parameters that these
+        move; no others are among the columns.
+    rows : (k, m, w + p + 1). The first w columns are by standard normal variables in the place of
+        these (`TreeElimination.roots`); the next p are those of the machine as the nuisance
         parameters follow it; the last are residuals.
     kind : number of the kind; -1 where they are of several. numbers : (k,) rows of the kind.
     """
 
     poses: IntArray
+    unknowns: IntArray
     rows: FloatArray
     kind: int
     numbers: IntArray
+
+    def spread(self, count: int) -> FloatArray:
+        """Return the rows (k, m, U + p + 1) by all U nuisance parameters."""
+        w = self.unknowns.shape[1]
+        rows = np.zeros((*self.rows.shape[:2], count + self.rows.shape[2] - w))
+        places = np.broadcast_to(self.unknowns[:, None], self.rows[..., :w].shape)
+        np.put_along_axis(rows, places, self.rows[..., :w], axis=2)
+        rows[..., count:] = self.rows[..., w:]
+        return rows
 
 
 @dataclass(frozen=True, eq=False)

@@ -88,25 +88,22 @@ def spread_rows(
     p: int,
     at_nodes: AtNodes | None,
 ) -> Iterator[LeverageRows]:
-    """Give rows with columns for all nuisance parameters, poses eliminated (one trial).
+    """Give rows with columns for the nuisance parameters that they move, poses eliminated (one
+    trial).
 
     The columns of the p free parameters are those by which the nuisance parameters follow.
     `at_nodes` is None without nuisance parameters.
     """
-    wide = 0 if poses.nuisance is None else len(poses.nuisance)
     for part in node_rows:
-        whitened = part.rows[0]
-        w = whitened.shape[-1] - p - 1
-        rows = np.zeros((*whitened.shape[:2], wide + p + 1))
-        rows[..., -p - 1 :] = whitened[..., w:]
+        rows, path = part.rows[0], np.zeros((len(part.nodes), 0), dtype=np.int64)
         if at_nodes is not None and part.structure >= 0:
             path, root, slope = at_nodes(part.nodes)
-            rows[..., -p - 1 : -1] += whitened[..., :w] @ slope
-            k, m = np.ogrid[: len(whitened), : whitened.shape[1]]
-            rows[k[..., None], m[..., None], path[:, None, :]] = whitened[..., :w] @ root
+            moved, rows = rows[..., : -p - 1], rows[..., -p - 1 :].copy()
+            rows[..., :-1] += moved @ slope
+            rows = np.concatenate([moved @ root, rows], axis=2)
         is_left = part.kind < 0  # rows of components, whose poses are eliminated
         first = poses.first_pose if is_left else block.poses[block.rows[part.kind].first_poses]
-        yield LeverageRows(first[part.numbers], rows, part.kind, part.numbers)
+        yield LeverageRows(first[part.numbers], path, rows, part.kind, part.numbers)
 
 
 CONTROL = Halving(steps=10, attempts=10, relative=0.0, absolute=1e-9, stuck=1e-3)

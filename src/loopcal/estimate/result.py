@@ -919,7 +919,7 @@ def estimate_nuisance(
         linearization.nuisance.best[0],
         np.sqrt(square),
         slope,
-        np.hstack([done.joint_root()[0] * np.sqrt(noise), UNDETERMINED * done.null_directions()]),
+        np.hstack([done.joint_root() * np.sqrt(noise), UNDETERMINED * done.null_directions()]),
         is_unobservable,
         shown,
         _only_displaces(robot, table, is_unobservable, int(is_free.sum() - done.rank[0])),

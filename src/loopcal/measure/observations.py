@@ -422,14 +422,15 @@ class Observations:
             parts.append(NoisePart("", rest))
         if len(parts) == 1:
             return [(parts[0].name, parts[0].size, None)]
-        weight = np.where(self.weight > 0.0, self.weight, np.inf)[:, None, None]
+        W = drop_repeats(self.whitener)
+        alike = slice(len(W) if len(W) == 1 else None)  # the rows that are enough
+        weight = np.where(self.weight > 0.0, self.weight, np.inf)[alike, None, None]
         split = []
         for part in parts:
-            inner = np.where(self.present[:, :, None], part.covariance, 0.0)
-            whitened = self.whitener @ inner @ np.swapaxes(self.whitener, 1, 2)
-            share, axes = np.linalg.eigh(whitened / weight)
+            inner = np.where(self.present[alike, :, None], drop_repeats(part.covariance), 0.0)
+            share, axes = np.linalg.eigh(W @ inner @ np.swapaxes(W, 1, 2) / weight)
             root = np.sqrt(np.maximum(share, 0.0))[:, :, None] * np.swapaxes(axes, 1, 2)
-            split.append((part.name, part.size, root))
+            split.append((part.name, part.size, np.broadcast_to(root, self.whitener.shape)))
         return split
 
     def with_weights(self, weight: ArrayLike) -> Self:

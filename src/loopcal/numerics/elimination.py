@@ -350,20 +350,28 @@ class TreeElimination(TrialBatch):
         return path, self.roots[structure][0][places], self.slope[0][path]
 
     def joint_root(self, unknowns: IntArray | None = None) -> FloatArray:
-        """Return a square root (a, u, u) of the covariance, at a known machine, of all unknowns, or
-        of all of some clusters.
+        """Return a square root (u, u) of the covariance, at a known machine, of all unknowns, or of
+        all of some clusters (first trial).
 
         Its columns belong to independent standard normal variables; see `roots`.
         """
         chosen = np.arange(self.shift.shape[1]) if unknowns is None else unknowns
         place = np.full(self.shift.shape[1], -1)
         place[chosen] = np.arange(len(chosen))
-        joint = np.zeros((len(self.shift), len(chosen), len(chosen)))
+        joint = np.zeros((len(chosen), len(chosen)))
         for structure, root in zip(self.tree.structures, self.roots, strict=True):
             nodes, u = place[structure.unknowns[:, 0]] >= 0, structure.unknowns.shape[1]
             rows, columns = place[structure.unknowns[nodes]], place[structure.path[nodes]]
-            joint[:, rows[:, :, None], columns[:, None, :]] = root[:, nodes, :u]
+            joint[rows[:, :, None], columns[:, None, :]] = root[0, nodes, :u]
         return joint
+
+    def move_unknowns(self, x: FloatArray) -> FloatArray:
+        """Return the root of `joint_root` times x (U, c)."""
+        moved = np.zeros_like(x)
+        for structure, root in zip(self.tree.structures, self.roots, strict=True):
+            own = root[0, :, : structure.unknowns.shape[1]]
+            moved[structure.unknowns] = np.matmul(own, x[structure.path])
+        return moved
 
     def null_directions(self) -> FloatArray:
         """Return the directions (U, d) that no row of the first trial determines, at a known

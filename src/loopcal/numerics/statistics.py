@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,6 +17,9 @@ from loopcal.numerics.distributions import (
     normal_probability,
 )
 from loopcal.typing import FloatArray, IntArray
+
+if TYPE_CHECKING:
+    from loopcal.numerics.split_columns import SplitColumns
 
 NODES = 101
 """Values of the true noise of each source over which a probability is averaged."""
@@ -225,13 +228,13 @@ class Remainder(NamedTuple):
     quadratic form v' (1 - P P') v of their inverse on what nothing estimated explains.
     """
 
-    taken: FloatArray  # (R, e) P: the basis of what is estimated, and parts of components
+    taken: SplitColumns  # (R, e) P: the basis of what is estimated, and parts of components
     residual: FloatArray  # (R,)
     degrees: float
 
     def weigh(self, columns: FloatArray) -> FloatArray:
         """Return (1 - P P') columns (R, c)."""
-        return columns - self.taken @ (self.taken.T @ columns)
+        return self.taken.remove(columns)
 
     def find_spectrum(self, columns: FloatArray) -> Spectrum:
         """Return the part of the residuals that independent errors of equal variance with these
@@ -239,8 +242,8 @@ class Remainder(NamedTuple):
         """
         changed = np.flatnonzero(columns.any(axis=1))
         own = columns[changed]
-        known, weighed = own.T @ self.taken[changed], self.weigh(self.residual)
-        w, vectors = np.linalg.eigh(own.T @ own - known @ known.T)
+        known, weighed = self.taken.take(changed).products(own), self.weigh(self.residual)
+        w, vectors = np.linalg.eigh(own.T @ own - known.T @ known)
         kept = w > UNSEEN * float((own**2).sum(axis=0).max(initial=0.0))
         vectors = vectors[:, kept] / np.sqrt(w[kept])
         y, square = (weighed[changed] @ own) @ vectors, float(self.residual @ weighed)
@@ -254,7 +257,7 @@ class Remainder(NamedTuple):
         w, is_open = spectrum.weights, np.isinf(ratio)
         share = np.ones(len(w)) if is_open else np.sqrt(ratio * w / (1.0 + ratio * w))
         axes = self.weigh(spectrum.columns) @ (spectrum.vectors * share)
-        taken = np.concatenate([self.taken, axes], axis=1)
+        taken = self.taken.append(axes)
         return self._replace(taken=taken, degrees=self.degrees - (len(w) if is_open else 0))
 
 
