@@ -26,7 +26,7 @@ from loopcal.io.robot.robot_file import load_robot
 from loopcal.io.runs.result_files import format_compensation, load_targets
 from loopcal.measure.measurements import Measurements
 from loopcal.report.calibration_view import view_compensation
-from tests.diagnose.correlated_data import ROBOTS, draw_errors, make_residual_rows, measure
+from tests.diagnose.correlated_data import ROBOTS, draw_errors, make_rows, measure
 
 MORE, MOST = 8, 24.0
 """Times as many rows, and the largest growth of the time: 8 in proportion, 64 for all pairs."""
@@ -170,7 +170,7 @@ def draw_rows(count: int, parameters: int) -> ResidualRows:
     """Return rows with random residuals of a fit of some parameters."""
     rng = np.random.default_rng(1)
     basis = np.linalg.qr(rng.standard_normal((count, parameters)))[0]
-    return make_residual_rows(basis, rng.standard_normal(count))
+    return make_rows(basis, rng.standard_normal(count))
 
 
 def test_rows_that_a_fit_does_not_use_are_as_good_as_those_with_an_error_of_their_own() -> None:

@@ -70,7 +70,7 @@ def draw_errors(n: int, m: int, seed: int, correlation: float = 0.0) -> np.ndarr
     return errors
 
 
-def make_residual_rows(basis, errors, series=None):
+def make_rows(basis, errors, series=None):
     """Return rows (R,) with given errors, from which what is estimated, basis (R, q), is taken."""
     zero, columns = np.zeros(len(errors), dtype=np.int64), SplitColumns.of(basis)
     root = FitRoot(np.eye(basis.shape[1]), zero[:0], None)

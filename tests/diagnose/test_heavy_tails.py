@@ -18,7 +18,7 @@ from loopcal.estimate.identification import identify
 from loopcal.estimate.losses import Huber
 from loopcal.findings import Severity
 from loopcal.results.serialization import to_json
-from tests.diagnose.correlated_data import ROBOTS, draw_errors, make_residual_rows, measure
+from tests.diagnose.correlated_data import ROBOTS, draw_errors, make_rows, measure
 
 CODE = "residuals.heavy-tailed"
 N = 30
@@ -43,10 +43,7 @@ def test_normal_errors_of_few_correlated_or_many_residuals_have_the_stated_level
     basis = np.linalg.qr(rng.standard_normal((rows, taken)) ** 3)[0]  # uneven leverage
     count = 120 if rows < 1000 else 30
     p = np.array(
-        [
-            assess_tails(make_residual_rows(basis, e)).p_value
-            for e in rng.standard_normal((count, rows))
-        ]
+        [assess_tails(make_rows(basis, e)).p_value for e in rng.standard_normal((count, rows))]
     )
     # probabilities above 0.05 come from few draws, but are not biased
     assert kstest(p, "uniform").pvalue > 1e-3
@@ -91,7 +88,7 @@ def test_fits_with_a_loss_or_few_degrees_of_freedom_are_not_tested():
     robust = identify(ROBOTS["linear-delta"], data, loss=Huber())
     assert np.isnan(check_heavy_tails(robust, data).p_value)
     basis = np.linalg.qr(np.random.default_rng(0).standard_normal((20, 17)))[0]
-    rows = make_residual_rows(basis, np.ones(20))
+    rows = make_rows(basis, np.ones(20))
     assert np.isnan(assess_tails(rows).p_value)
 
 

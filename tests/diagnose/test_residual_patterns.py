@@ -18,7 +18,7 @@ from loopcal.estimate.fit_linearization import linearize_fit
 from loopcal.estimate.identification import identify
 from loopcal.estimate.penalties import LeastSquares, Ridge
 from loopcal.numerics.statistics import compute_any_probability, compute_single_level
-from tests.diagnose.correlated_data import ROBOTS, draw_errors, make_residual_rows, measure
+from tests.diagnose.correlated_data import ROBOTS, draw_errors, make_rows, measure
 
 
 def collect(robot, kind, errors, seed, method=None, **context):
@@ -62,9 +62,7 @@ def test_correlation_has_its_stated_probabilities_where_the_fit_takes_up_half_of
     smooth = np.cos(np.outer(np.arange(10), np.arange(5)) * np.pi / 10)
     basis = np.linalg.qr(np.kron(np.eye(3), smooth))[0]  # takes up what changes slowly
     drawn = rng.standard_normal((2000, 30))
-    p_values = np.array(
-        [compute_correlation(make_residual_rows(basis, e, series))[1] for e in drawn]
-    )
+    p_values = np.array([compute_correlation(make_rows(basis, e, series))[1] for e in drawn])
     assert kstest(p_values, "uniform").pvalue > 1e-3
     assert 0.03 < (p_values < 0.05).mean() < 0.07
     assert 0.002 < (p_values < 0.01).mean() < 0.02
