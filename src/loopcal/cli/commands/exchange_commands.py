@@ -419,11 +419,23 @@ def export(
     keep_frame: bool = opt.option(
         "Write values of equal relative accuracy that leave programs in place.", is_flag=True
     ),
+    controller: str | None = opt.option(
+        "Robot file with the geometry of the controller, for a table of corrections (--format "
+        "grid). Default: as before the calibration.",
+        metavar="ROBOT",
+    ),
+    table_error: float | None = opt.option(
+        "Largest error that a table may leave between its nodes.  [default: a tenth of the error]",
+        type=opt.POSITIVE_LENGTH,
+    ),
     force: bool = opt.force(
         "the output file", ", and write also the numbers of a calibration that failed"
     ),
 ) -> Output:
     """Write the parameters of RUN, or of a robot file, as another program reads them.
+
+    The formats grid, grid-klipper, grid-reprap and grid-linuxcnc are tables of corrections for a
+    controller that keeps its geometry. A note states the error that remains between nodes.
 
     Without -o, the command prints lines to type: each identified value has three digits of its
     uncertainty, and at most the decimals that the controller keeps. Files have all digits. A note
@@ -435,8 +447,10 @@ def export(
       loopcal export run --format klipper --into printer.cfg -o corrected.cfg
       loopcal export run --format reprap -o config-override.g
       loopcal export run -o parameters.csv
+      loopcal export run --format grid --table-error 5um -o grid.csv
     """
     from loopcal.apply.base_motion import choose_base
+    from loopcal.apply.correction_tables import TableSize, make_tables
     from loopcal.io.core.outputs import refuse_outputs
     from loopcal.io.core.text_file import write_text
     from loopcal.io.formats.import_export import build_source, choose_format, export_robot
@@ -449,6 +463,8 @@ def export(
         )
     target = choose_format(output or Path(), format_name, is_written=True)
     refuse_outputs((output,), (Path(source),), force)  # the file of --into may be corrected
+    if target.table is None:
+        opt.refuse_given(("controller", "table_error"), "without --format grid")
     failure = find_failure(source)
     failures = [] if failure is None else [failure]
     if failures and not force:
@@ -457,10 +473,17 @@ def export(
     run = load_run_or_robot(source)
     robot, moved = choose_base(run.result, run.initial_robot, run.robot, keep_frame)
     loaded = build_source(replace(run, robot=robot))
+    if target.table is not None:
+        old = run.initial_robot if controller is None else lc.load_robot(controller)
+        tables, noted = make_tables(robot, old, TableSize(*target.table), table_error)
+        loaded, moved = replace(loaded, tables=tables), (*moved, *noted)
     loaded = replace(loaded, is_for_people=output is None, findings=moved)
     exported = export_robot(loaded, target, into)
     if output is not None:
-        write_text(output, exported.text)
+        beside = {output.parent / name: text for name, text in exported.beside.items()}
+        refuse_outputs((output, *beside), (Path(source),), force)
+        for file, text in {output: exported.text, **beside}.items():
+            write_text(file, text)
     notes = [str(finding) for finding in exported.findings]
     document = {"output": output, "format": target.name, "notes": notes, "reasons": failures}
     document |= {"text": exported.text} if output is None else {}
@@ -468,7 +491,7 @@ def export(
     def view() -> list[str] | str:
         noted = [with_hint(finding) for finding in exported.findings]
         if output is not None:
-            return [*noted, f"Written to {output}"]
+            return [*noted, f"Written to {', '.join(map(str, (output, *beside)))}"]
         for note in noted:
             terminal.print_note(note)
         return exported.text

@@ -29,6 +29,7 @@ from loopcal.plain_text import quote
 from loopcal.units import LARGEST
 
 if TYPE_CHECKING:
+    from loopcal.apply.correction_tables import CorrectionTable, What
     from loopcal.measure.kinds.kind import Kind
     from loopcal.measure.measurements import Measurements
     from loopcal.measure.observations import Observations
@@ -115,7 +116,7 @@ class ExportSource:
         there is none. nulls : parameter -> reason why there is none.
     is_for_people : whether the numbers are to be read and typed: an identified value then has the
         digits that its interval supports. Files for programs have all digits.
-    findings : about these values in any controller.
+    findings : about these values in any controller. tables : corrections, for a format of tables.
     """
 
     robot: Mechanism
@@ -123,6 +124,7 @@ class ExportSource:
     nulls: Mapping[str, str] = field(default_factory=dict)
     is_for_people: bool = False
     findings: tuple[Finding, ...] = ()
+    tables: tuple[CorrectionTable, ...] = ()
 
     def round_number(self, number: float, name: str, factor: float, most: int) -> float:
         """Return a number as it is written, in a unit of `factor` to SI: for people to the third
@@ -142,10 +144,13 @@ class ExportSource:
 
 @dataclass(frozen=True)
 class Exported:
-    """The text of a file of another program; findings are changes, and what it cannot express."""
+    """The text of a file of another program; findings are changes, and what it cannot express.
+    `beside` : name -> text of files that it refers to, in its folder.
+    """
 
     text: str
     findings: tuple[Finding, ...] = ()
+    beside: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -160,6 +165,8 @@ class Format:
     takes_file : whether `write` can correct an existing file.
     read_options : options of `ImportOptions` that `read` uses -> what is particular to this format,
         such as which lengths are taped, for help texts.
+    table : of a format of corrections what it corrects, and the most nodes that it may have, in all
+        and along an axis: see `loopcal.apply.correction_tables.TableSize`.
     stores_fit : whether a file contains a geometry together with the measurements that its firmware
         fitted it to, so that `loopcal.diagnose` can compare the two.
     """
@@ -172,6 +179,7 @@ class Format:
     takes_file: bool = True
     read_options: Mapping[str, str] = field(default_factory=dict)
     stores_fit: bool = False
+    table: tuple[What, int, int] | None = None
 
 
 def get_record(

@@ -6,16 +6,19 @@ import json
 import os
 import shutil
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory, gettempdir
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
 import pytest
 
 import loopcal as lc
+from loopcal.apply.correction_tables import TableSize, make_tables
 from loopcal.io.formats import linuxcnc as genhexkins
+from loopcal.io.formats.correction_files import write_compensation
 from loopcal.io.formats.linuxcnc_kinematics import NAME, write
 from loopcal.io.formats.program_format import ExportSource
 from tests.robot_texts import load_text
@@ -39,9 +42,10 @@ drives:
 """Scale errors of screws, which genhexkins cannot store."""
 
 DRIVER = """#!/usr/bin/python3
-import json, time, linuxcnc
+import json, time, hal, linuxcnc
 moves, joints = json.load(open("moves.json"))
-command, state, reached = linuxcnc.command(), linuxcnc.stat(), []
+command, state, reached, motors = linuxcnc.command(), linuxcnc.stat(), [], []
+reader = hal.component("reader"); reader.ready()
 def wait(condition):
     end = time.time() + 20
     while time.time() < end:
@@ -66,7 +70,8 @@ for move in moves:
         return state.inpos and len(seen) > 9 and seen[-1] == seen[-2] == seen[-10]
     wait(rests)
     reached.append(state.joint_position[:joints])
-json.dump(reached, open("reached.json", "w"))
+    motors.append([hal.get_value("joint.%d.motor-pos-cmd" % j) for j in range(joints)])
+json.dump([reached, motors], open("reached.json", "w"))
 """
 
 SETTINGS = """[EMC]
@@ -149,8 +154,16 @@ def component(tmp_path: Path) -> Iterator[Path]:
         (MODULES / f"{NAME}.so").unlink(missing_ok=True)
 
 
-def run_linuxcnc(kinematics: str, hal: str, homes: np.ndarray, poses: np.ndarray) -> np.ndarray:
-    """Return joint positions (n, 6) [mm] after moves to poses, from a home."""
+def run_linuxcnc(
+    kinematics: str,
+    hal: str,
+    homes: np.ndarray,
+    poses: np.ndarray,
+    compensation: Mapping[str, str] = MappingProxyType({}),
+) -> np.ndarray:
+    """Return positions of joints and of their motors (2, n, 6) [mm] after moves to poses, from a
+    home. `compensation` : name -> text of the file of each joint, none by default.
+    """
     joints = [f"net J{j} joint.{j}.motor-pos-cmd => joint.{j}.motor-pos-fb" for j in range(6)]
     lines = [
         f"loadrt {kinematics}",
@@ -162,13 +175,18 @@ def run_linuxcnc(kinematics: str, hal: str, homes: np.ndarray, poses: np.ndarray
     ]
     text = SETTINGS + f"KINEMATICS = {kinematics}\nJOINTS = 6\n"
     text += "".join(map(AXIS.format, "XYZABC"))
-    text += "".join(JOINT.format(j, home, home) for j, home in enumerate(homes.tolist()))
+    for j, home in enumerate(homes.tolist()):
+        text += JOINT.format(j, home, home)
+        if (name := f"joint{j}.comp") in compensation:
+            text += f"COMP_FILE = {name}\nCOMP_FILE_TYPE = 1\n"
     with TemporaryDirectory() as name:  # LinuxCNC refuses to run as root
         place = Path(name)
         (place / "machine.ini").write_text(text)
         (place / "machine.hal").write_text("\n".join(lines) + "\n" + hal + "\n")
         (place / "moves.json").write_text(json.dumps([poses.tolist(), 6]))
         (place / "driver.py").write_text(DRIVER)
+        for file, content in compensation.items():
+            (place / file).write_text(content)
         (place / "driver.py").chmod(0o755)
         for path in (place, *place.iterdir()):
             shutil.chown(path, "nobody")
@@ -195,7 +213,7 @@ def test_the_component_moves_the_true_machine_to_the_commanded_poses(
     subprocess.run(["halcompile", "--install", component], check=True, capture_output=True)
     wanted = lc.inverse(calibrated.identified, calibrated.poses * UNITS).q
     homes = lc.inverse(calibrated.identified, calibrated.identified.home[None]).q[0] / MM
-    joints = run_linuxcnc(NAME, "", homes, calibrated.poses) * MM
+    joints = run_linuxcnc(NAME, "", homes, calibrated.poses)[0] * MM
     assert np.abs(joints - wanted).max() < 1e-6 * MM
     errors = measure_errors(calibrated, joints)
     square = np.einsum("ni,nij,nj->n", errors, np.linalg.inv(calibrated.covariance), errors)
@@ -210,7 +228,7 @@ def test_the_component_moves_the_true_machine_to_the_commanded_poses(
         )
         / MM
     )
-    struts = run_linuxcnc("genhexkins", pins, homes + starts, calibrated.poses)
+    struts = run_linuxcnc("genhexkins", pins, homes + starts, calibrated.poses)[0]
     left = measure_errors(calibrated, (struts - starts) * MM)
     rms, of_old = (float(np.sqrt((e**2).sum(axis=1).mean())) for e in (errors, left))
     assert rms < 10e-6
@@ -231,6 +249,26 @@ def test_a_pin_changes_a_parameter_without_compiling(
         for name, value, unit in zip(table.names, own.values.tolist(), units, strict=True)
     ]
     homes = lc.inverse(own, own.home[None]).q[0] / MM
-    joints = run_linuxcnc(NAME, "\n".join(pins), homes, calibrated.poses[:5]) * MM
+    joints = run_linuxcnc(NAME, "\n".join(pins), homes, calibrated.poses[:5])[0] * MM
     wanted = lc.inverse(own, calibrated.poses[:5] * UNITS).q
     assert np.abs(joints - wanted).max() < 1e-6 * MM
+
+
+def test_compensation_files_of_the_joints_correct_the_screws(
+    calibrated: Calibrated, component: Path
+) -> None:
+    """The controller has the joint centers, and the scales of the screws as tables."""
+    truth, table = calibrated.identified, calibrated.identified.parameters
+    is_gain = np.array([name.endswith(".gain") for name in table.names])
+    controller = truth.with_values(np.where(is_gain, table.nominal, truth.values))
+    tables, (found,) = make_tables(truth, controller, TableSize("readings", 256, 256), 1e-6)
+    assert found.data["is_met"]
+    files = write_compensation(ExportSource(truth, tables=tables), None).beside
+    component.write_text(write(ExportSource(controller, {}, {}), None).text, "utf-8")
+    subprocess.run(["halcompile", "--install", component], check=True, capture_output=True)
+    homes = lc.inverse(controller, controller.home[None]).q[0] / MM
+    joints, motors = run_linuxcnc(NAME, "", homes, calibrated.poses, files)
+    wanted = lc.inverse(truth, calibrated.poses * UNITS).q / MM
+    assert np.abs(joints - wanted).max() > 0.02
+    # homed in place, motors count from the home; six decimals of a table, at both of its nodes
+    assert np.abs(motors + homes - wanted).max() < 2e-6

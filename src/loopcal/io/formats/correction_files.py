@@ -1,0 +1,149 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tables of corrections as files: CSV, height maps of Klipper and RepRapFirmware, LinuxCNC.
+
+Klipper: a profile of [bed_mesh], `[bed_mesh loopcal]`, whose heights are added to z. With `direct`
+its mesh consists of these points, between which it interpolates linearly. RepRapFirmware:
+heightmap.csv with a line of labels, one of the grid, and rows of heights by y, which are added to
+z; a firmware reads lines of 8 characters for each height. LinuxCNC: a compensation file for each
+joint has `nominal forward reverse` in a line, at most 256 of them. With COMP_FILE_TYPE = 1 the last
+two are what is added to the motor's position in each direction, in the machine's unit. Source:
+Klipper's "Bed mesh" and its module bed_mesh; RepRapFirmware's Grid; LinuxCNC's "INI configuration"
+(COMP_FILE) and usrmotintf.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from pathlib import Path
+
+import numpy as np
+
+from loopcal.findings import report_finding
+from loopcal.io.formats.c_kinematics import note_lost_terms
+from loopcal.io.formats.program_format import (
+    MM,
+    Exported,
+    ExportSource,
+    Format,
+    format_number,
+    format_short,
+)
+from loopcal.mechanism.platform_coordinates import get_dimension
+from loopcal.typing import FloatArray
+from loopcal.units import UNITS, Dimension
+
+PROFILE = "loopcal"
+DIGITS = 9
+"""Significant digits of a CSV file: of a meter, a nanometer."""
+
+
+def write_grid(source: ExportSource, into: Path | None) -> Exported:
+    """Return one row for each node: where it is, and what to add there."""
+    del into
+    (table,), robot = source.tables, source.robot
+    units = {name: robot.get_unit(get_dimension(name)) for name in (*table.axes, *table.values)}
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    names = [f"{name} [{units[name]}]" for name in table.axes]
+    writer.writerow([*names, *(f"add {name} [{units[name]}]" for name in table.values)])
+    places = np.meshgrid(*table.axes.values(), indexing="ij")
+    columns = [*zip(table.axes, places, strict=True), *table.values.items()]
+    cells = [(values / units[name].factor_to_si).ravel() for name, values in columns]
+    for row in zip(*cells, strict=True):
+        writer.writerow([f"{0.0 + number:.{DIGITS}g}" for number in row])
+    return Exported(stream.getvalue())
+
+
+def _get_heights(source: ExportSource) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the nodes along x and y, and the heights (y, x) [mm]."""
+    (table,) = source.tables
+    return table.axes["x"] / MM, table.axes["y"] / MM, table.values["z"].T / MM
+
+
+def write_mesh(source: ExportSource, into: Path | None) -> Exported:
+    """Return a profile of Klipper, a file to include."""
+    del into
+    x, y, heights = _get_heights(source)
+    lines = ["# [bed_mesh] has to be in printer.cfg, and BED_MESH_PROFILE LOAD=loopcal to run."]
+    lines += [f"[bed_mesh {PROFILE}]", "version: 1", "points:"]
+    lines += ["    " + ", ".join(map(format_number, row)) for row in heights.tolist()]
+    for name, nodes in (("x", x), ("y", y)):
+        lines += [
+            f"min_{name}: {format_number(nodes[0])}",
+            f"max_{name}: {format_number(nodes[-1])}",
+        ]
+        lines += [f"{name}_count: {len(nodes)}", f"mesh_{name}_pps: 0"]
+    text = "\n".join([*lines, "algo: direct", "tension: 0.2"]) + "\n"
+    return Exported(text, (report_finding("files.mesh-loads", profile=PROFILE),))
+
+
+def write_height_map(source: ExportSource, into: Path | None) -> Exported:
+    """Return a heightmap.csv, in the form of RepRapFirmware 3.3 and later."""
+    del into
+    x, y, heights = _get_heights(source)
+    decimals = 4 if np.abs(heights).max() < 10.0 else 3
+    numbers = [x[0], x[-1], y[0], y[-1], -1.0, x[1] - x[0], y[1] - y[0]]
+    statistics = zip(
+        ("min error", "max error", "mean", "deviation"),
+        (heights.min(), heights.max(), heights.mean(), heights.std()),
+        strict=True,
+    )
+    head = ", ".join(f"{name} {value:.3f}" for name, value in statistics)
+    lines = [f"RepRapFirmware height map file v2 by loopcal, {head}"]
+    lines += ["axis0,axis1,min0,max0,min1,max1,radius,spacing0,spacing1,num0,num1"]
+    grid = ",".join(format_short(number, 6) for number in numbers)
+    lines += [f"X,Y,{grid},{len(x)},{len(y)}"]
+    lines += [",".join(f"{0.0 + h:.{decimals}f}" for h in row) for row in heights.tolist()]
+    return Exported("\n".join(lines) + "\n", (report_finding("files.height-map-loads"),))
+
+
+def write_compensation(source: ExportSource, into: Path | None) -> Exported:
+    """Return the lines of the INI file, and a compensation file for each joint."""
+    del into
+    robot, lines, files = source.robot, list[str](), dict[str, str]()
+    dimensions = {actuator.name: actuator.dimension for actuator in robot.actuators}
+    for joint, table in enumerate(source.tables):
+        (name, nodes), (trims,) = *table.axes.items(), table.values.values()
+        is_length = dimensions[name] is Dimension.LENGTH
+        unit = robot.get_unit(Dimension.LENGTH) if is_length else UNITS["deg"]
+        rows = np.column_stack([nodes, trims, trims]) / unit.factor_to_si
+        files[f"joint{joint}.comp"] = "".join(
+            " ".join(map(format_number, (0.0 + row).tolist())) + "\n" for row in rows
+        )
+        lines += [f"[JOINT_{joint}]  # {name}", f"COMP_FILE = joint{joint}.comp"]
+        lines += ["COMP_FILE_TYPE = 1"]
+    notes = note_lost_terms(robot, COMPENSATION.name)
+    if source.is_for_people:
+        lines += [f"# {file}\n{text.rstrip()}" for file, text in files.items()]
+    return Exported("\n".join(lines) + "\n", notes, files)
+
+
+GRID = Format(
+    "grid",
+    "corrections over a grid, as CSV",
+    write=write_grid,
+    takes_file=False,
+    table=("commands", 20000, 500),
+)
+KLIPPER = Format(
+    "grid-klipper",
+    "height map of Klipper",
+    write=write_mesh,
+    takes_file=False,
+    table=("height", 10000, 99),
+)
+REPRAP = Format(
+    "grid-reprap",
+    "heightmap.csv of RepRapFirmware",
+    write=write_height_map,
+    takes_file=False,
+    table=("height", 441, 41),
+)
+COMPENSATION = Format(
+    "grid-linuxcnc",
+    "compensation files of LinuxCNC's joints",
+    write=write_compensation,
+    takes_file=False,
+    table=("readings", 256, 256),
+)
