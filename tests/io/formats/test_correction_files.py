@@ -17,6 +17,7 @@ from tests.apply.test_correction_tables import disturb
 from tests.io.formats.delta_printers.real_klipper import Printer, install
 
 MM, LIMIT = 1e-3, 5e-6
+Pair = tuple[lc.Mechanism, lc.Mechanism]
 WRITTEN = 0.1e-6
 """Rounding of heights in the files [m]."""
 
@@ -36,7 +37,7 @@ def move(truth: lc.Mechanism, controller: lc.Mechanism, commands: np.ndarray) ->
 
 
 @pytest.fixture(scope="module")
-def machine() -> tuple[lc.Mechanism, lc.Mechanism]:
+def machine() -> Pair:
     """A delta printer, and what its controller believes."""
     controller = lc.load_robot("linear-delta")
     return disturb(controller), controller
@@ -49,7 +50,7 @@ def points() -> np.ndarray:
 
 
 @pytest.mark.slow
-def test_klipper_with_the_mesh_prints_flat(tmp_path, machine, points) -> None:
+def test_klipper_with_the_mesh_prints_flat(tmp_path, machine: Pair, points) -> None:
     install()
     (tmp_path / "mesh.cfg").write_text(export(*machine, "grid-klipper").text)
     config = tmp_path / "printer.cfg"
@@ -67,7 +68,7 @@ def test_klipper_with_the_mesh_prints_flat(tmp_path, machine, points) -> None:
     assert np.abs(move(*machine, points)[:, 2]).max() > 0.1
 
 
-def test_reprapfirmware_with_the_height_map_prints_flat(machine, points) -> None:
+def test_reprapfirmware_with_the_height_map_prints_flat(machine: Pair, points) -> None:
     """The reader is that of RepRapFirmware 3.3 by its rules: two lines of labels, of which one is
     compared, numbers by commas, no row longer than 8 characters a height, and linear interpolation.
     """
@@ -94,7 +95,7 @@ def test_reprapfirmware_with_the_height_map_prints_flat(machine, points) -> None
     assert np.abs(move(*machine, commands)[:, 2]).max() * MM < LIMIT + WRITTEN
 
 
-def test_rows_of_the_grid_lead_to_their_nodes(machine) -> None:
+def test_rows_of_the_grid_lead_to_their_nodes(machine: Pair) -> None:
     rows = list(csv.DictReader(io.StringIO(export(*machine, "grid").text)))
     table = np.array([[float(cell) for cell in row.values()] for row in rows])
     assert list(rows[0])[::3] == ["x [mm]", "add x [mm]"]
@@ -102,7 +103,7 @@ def test_rows_of_the_grid_lead_to_their_nodes(machine) -> None:
     np.testing.assert_allclose(reached, table[:, :3], rtol=0, atol=1e-6)  # [mm], nine digits
 
 
-def test_every_joint_of_linuxcnc_has_a_file(machine) -> None:
+def test_every_joint_of_linuxcnc_has_a_file(machine: Pair) -> None:
     exported = export(*machine, "grid-linuxcnc")
     for joint in range(3):
         assert f"[JOINT_{joint}]" in exported.text

@@ -479,11 +479,13 @@ def export(
         loaded, moved = replace(loaded, tables=tables), (*moved, *noted)
     loaded = replace(loaded, is_for_people=output is None, findings=moved)
     exported = export_robot(loaded, target, into)
+    written: dict[Path, str] = {}
     if output is not None:
         beside = {output.parent / name: text for name, text in exported.beside.items()}
-        refuse_outputs((output, *beside), (Path(source),), force)
-        for file, text in {output: exported.text, **beside}.items():
-            write_text(file, text)
+        written = {output: exported.text, **beside}
+        refuse_outputs(tuple(written), (Path(source),), force)
+    for file, text in written.items():
+        write_text(file, text)
     notes = [str(finding) for finding in exported.findings]
     document = {"output": output, "format": target.name, "notes": notes, "reasons": failures}
     document |= {"text": exported.text} if output is None else {}
@@ -491,7 +493,7 @@ def export(
     def view() -> list[str] | str:
         noted = [with_hint(finding) for finding in exported.findings]
         if output is not None:
-            return [*noted, f"Written to {', '.join(map(str, (output, *beside)))}"]
+            return [*noted, f"Written to {', '.join(map(str, written))}"]
         for note in noted:
             terminal.print_note(note)
         return exported.text
