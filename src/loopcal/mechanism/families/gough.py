@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from loopcal import geometry
 from loopcal.errors import MechanismError
@@ -46,15 +47,6 @@ Direction = tuple[Ratio, Ratio, Ratio]
 
 
 @dataclass(frozen=True)
-class ScrewLeg:
-    """Screw of one leg: lead [m per turn], joint axes fixed to base and platform (3,)."""
-
-    lead: float
-    base_axis: Direction
-    platform_axis: Direction
-
-
-@dataclass(frozen=True)
 class Screw:
     """Screws in the legs of a hexapod.
 
@@ -69,77 +61,58 @@ class Screw:
     base_axes: tuple[Direction, ...] = ()
     platform_axes: tuple[Direction, ...] = ()
 
-    def legs(self) -> tuple[ScrewLeg, ...]:
-        """Return the six screws; raises MechanismError for another number."""
-        if len(self.base_axes) != 6 or len(self.platform_axes) != 6:
-            raise MechanismError(
-                f"the screw names {len(self.base_axes)} base_axes and {len(self.platform_axes)} "
-                "platform_axes. Name six of each"
-            )
-        leads = values_per_leg(self.lead, 6, "the screw's lead")
-        return tuple(
-            ScrewLeg(*leg) for leg in zip(leads, self.base_axes, self.platform_axes, strict=True)
-        )
 
-
-def build_ups_leg(
-    name: str, motor: str, base: Direction, top: Direction, home: FloatArray, axes: bool
+def build_leg(
+    name: str,
+    motor: str,
+    base: Direction,
+    top: Direction,
+    home: FloatArray,
+    axes: bool = False,
+    screw: tuple[float, Direction, Direction] | None = None,
 ) -> PlacedLimb:
-    """Return a leg whose joints are all at zero in the home pose (4, 4), with centers in base and
-    platform [m]. With `axes` the upper joint has three axes in place of a ball.
+    """Return a leg between centers in base and platform [m], whose joints are all at zero in the
+    home pose (4, 4), but those of a screw, in which the reading alone drives the slide.
+
+    axes : the upper joint has three axes in place of a ball. screw : lead [m per turn], and joint
+    axes fixed to base and platform (3,).
     """
-    s, length = _find_direction(name, base, top, home)
-    first = _across(s, EZ)
-    # the axes in the base frame, which is the carried frame while every joint is at zero
-    steps = (
-        JointPlacement(Joint("universal1", "R"), translate(*base), first),
-        JointPlacement(Joint("universal2", "R"), np.eye(4), np.cross(s, first)),
-        JointPlacement(Joint("slide", "P", motor, start=length), np.eye(4), s),
+    gap = home[:3, :3] @ np.array(top, dtype=float) + home[:3, 3] - np.array(base, dtype=float)
+    s, length = _normalize(
+        gap, f"{name} has length zero at home. Move its centers or the home pose"
     )
-    return place_limb_with_ball(
-        name, steps, np.zeros(3), translate(*top), home[:3, :3] if axes else None
-    )
-
-
-def build_screw_leg(
-    name: str, motor: str, base: Direction, top: Direction, home: FloatArray, screw: ScrewLeg
-) -> PlacedLimb:
-    """Return a leg with a screw, in which the reading alone drives the slide."""
-    s, length = _find_direction(name, base, top, home)
-    lower = _normalize(name, screw.base_axis)
-    upper = home[:3, :3] @ _normalize(name, screw.platform_axis)
-    for axis in (lower, upper):
-        if np.linalg.norm(np.cross(axis, s)) < 1e-6:
+    pitch = turned = 0.0
+    lower = upper = _across(s, EZ)
+    if screw:
+        zero = f"a joint axis of {name} is [0, 0, 0]. Give a direction"
+        (lower, _), (upper, _) = (_normalize(axis, zero) for axis in screw[1:])
+        upper = home[:3, :3] @ upper
+        if min(np.linalg.norm(np.cross(axis, s)) for axis in (lower, upper)) < 1e-6:
             raise MechanismError(
                 f"a screw's joint axis lies along {name} at home. Give it another direction"
             )
+        pitch = screw[0] / (2 * np.pi)
     low, high = _across(s, lower), _across(s, upper)
-    turned = float(np.arctan2(np.cross(low, high) @ s, low @ high))
-    # at zero the spindle stands turned back by the angle that it has at home
-    back = rotation_matrix(geometry.exp_so3(-turned * s))
-    pitch = screw.lead / (2 * np.pi)
-    slide = Joint("slide", "P", motor, start=length + pitch * turned)
-    thread = Joint("screw", "R", pitch=-pitch, start=turned)
+    if screw:
+        turned = float(np.arctan2(np.cross(low, high) @ s, low @ high))
+    # the axes in the base frame, which is the carried frame while every joint is at zero
     steps = (
         JointPlacement(Joint("universal1", "R"), translate(*base), lower),
         JointPlacement(Joint("universal2", "R"), np.eye(4), np.cross(s, low)),
-        JointPlacement(slide, np.eye(4), s),
-        JointPlacement(thread, np.eye(4), s),
+        JointPlacement(Joint("slide", "P", motor, start=length + pitch * turned), np.eye(4), s),
+    )
+    if not screw:
+        ball = home[:3, :3] if axes else None
+        return place_limb_with_ball(name, steps, np.zeros(3), translate(*top), ball)
+    # at zero the spindle stands turned back by the angle that it has at home
+    back = rotation_matrix(geometry.exp_so3(-turned * s))
+    thread = (
+        JointPlacement(Joint("screw", "R", pitch=-pitch, start=turned), np.eye(4), s),
         JointPlacement(Joint("universal3", "R"), back, np.cross(s, high)),
         JointPlacement(Joint("universal4", "R"), np.eye(4), upper),
     )
-    return place_limb(name, steps, rotation_matrix(home[:3, :3]), "rigid", translate(*top))
-
-
-def _find_direction(
-    name: str, base: Direction, top: Direction, home: FloatArray
-) -> tuple[FloatArray, float]:
-    """Return the unit vector from the lower center to the upper one at home, and the distance."""
-    gap = home[:3, :3] @ np.array(top, dtype=float) + home[:3, 3] - np.array(base, dtype=float)
-    length = float(np.linalg.norm(gap))
-    if not length > 0:
-        raise MechanismError(f"{name} has length zero at home. Move its centers or the home pose")
-    return gap / length, length
+    end = rotation_matrix(home[:3, :3]), "rigid", translate(*top)
+    return place_limb(name, (*steps, *thread), *end)
 
 
 def _across(s: FloatArray, axis: FloatArray) -> FloatArray:
@@ -150,12 +123,12 @@ def _across(s: FloatArray, axis: FloatArray) -> FloatArray:
     return np.array(part / np.linalg.norm(part), dtype=float)
 
 
-def _normalize(name: str, axis: Direction) -> FloatArray:
-    """Return a unit vector (3,); raises MechanismError for zero."""
-    length = float(np.linalg.norm(axis))
+def _normalize(vector: ArrayLike, refusal: str) -> tuple[FloatArray, float]:
+    """Return a vector (3,) as unit vector and length; raises MechanismError for zero."""
+    length = float(np.linalg.norm(vector))
     if not length > 0:
-        raise MechanismError(f"a joint axis of {name} is [0, 0, 0]. Give a direction")
-    return np.array(axis) / length
+        raise MechanismError(refusal)
+    return np.array(vector) / length, length
 
 
 @dataclass(frozen=True)
@@ -239,29 +212,29 @@ class Gough(RobotRecord):
         )
 
     def _check(self) -> None:
-        if len(self.base) != 6 or len(self.platform) != 6:
-            raise MechanismError(
-                f"{self.name} has {len(self.base)} base and {len(self.platform)} platform centers; "
-                "a hexapod has six of each"
-            )
-        stated = {
-            "error_model: complete": self.error_model == "complete",
-            "spherical: axes": self.spherical == "axes",
-            "a screw": self.screw is not None,
-        }
-        asked = [words for words, is_stated in stated.items() if is_stated]
-        model = "complete" if self.legs == "rod" else self.error_model
-        check_spherical(self.name, self.spherical, model)
-        if self.legs == "ups" and self.cones != GoughCones():
-            raise MechanismError(
-                f"{self.name} states cones with legs: ups, whose joints have no cones. Give legs: "
-                "rod"
-            )
-        if self.legs == "rod" and asked:
-            raise MechanismError(
-                f"{self.name} states legs: rod with {asked[0]}, but a rod has no joints that could "
-                "carry it. Give legs: ups"
-            )
+        is_rod = self.legs == "rod"
+        check_spherical(self.name, self.spherical, "complete" if is_rod else self.error_model)
+        needs_chain = "but a rod has no joints that could carry it. Give legs: ups"
+        for key, is_stated, reason in (
+            ("error_model: complete", is_rod and self.error_model == "complete", needs_chain),
+            ("spherical: axes", is_rod and self.spherical == "axes", needs_chain),
+            ("a screw", is_rod and self.screw is not None, needs_chain),
+            (
+                *("cones", not is_rod and self.cones != GoughCones()),
+                "whose joints have no cones. Give legs: rod",
+            ),
+        ):
+            if is_stated:
+                raise MechanismError(f"{self.name} states legs: {self.legs} with {key}, {reason}")
+        lists = [("base", self.base), ("platform", self.platform)]
+        if self.screw:
+            own = self.screw
+            lists += [("base_axes", own.base_axes), ("platform_axes", own.platform_axes)]
+        for key, values in lists:
+            if len(values) != 6:
+                raise MechanismError(
+                    f"{self.name} has {len(values)} values under `{key}:`; a hexapod has six"
+                )
 
     def _leg(self, i: int, length: float) -> PlacedLimb:
         """Return leg i in its form."""
@@ -270,19 +243,19 @@ class Gough(RobotRecord):
             ends = translate(*base), translate(*top)
             cones = self._cones(*ends)
             return place_limb(leg, (), ends[0], "distance", ends[1], length, motor, cones)
-        home = self.home.matrix
-        if self.screw:
-            return build_screw_leg(leg, motor, base, top, home, self.screw.legs()[i])
-        return build_ups_leg(leg, motor, base, top, home, self.spherical == "axes")
+        axes, screw = self.spherical == "axes", self.screw
+        of_leg = None
+        if screw:
+            leads = values_per_leg(screw.lead, 6, "the screw's lead")
+            of_leg = leads[i], screw.base_axes[i], screw.platform_axes[i]
+        return build_leg(leg, motor, base, top, self.home.matrix, axes, of_leg)
 
     def _cones(self, base: FloatArray, top: FloatArray) -> tuple[Cone, ...]:
         """Return the cones of a rod between these centers (4, 4), about its direction at home."""
         home = self.home.matrix
         rod = (home @ top)[:3, 3] - base[:3, 3]
-        ends = (
-            ("tip", self.cones.base, rod),
-            ("attachment", self.cones.platform, -home[:3, :3].T @ rod),
-        )
+        toward = -home[:3, :3].T @ rod
+        ends = ("tip", self.cones.base, rod), ("attachment", self.cones.platform, toward)
         return tuple(
             Cone(end, (float(axis[0]), float(axis[1]), float(axis[2])), angle)
             for end, angle, axis in ends
