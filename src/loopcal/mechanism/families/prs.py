@@ -11,7 +11,7 @@ revolute joint on it. Derivation: docs/theory/families.md.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import ClassVar, Literal, NamedTuple
 
@@ -31,6 +31,7 @@ from loopcal.mechanism.families.placement import (
     PlacedLimb,
     displacement_error,
     join_errors,
+    map_displacement,
     map_slide_tilt,
     offset_error,
     place_limb,
@@ -150,13 +151,12 @@ def carriage_errors(
         errors.append(
             displacement_error(rod, limb, "tip", "z", length, frames.length, positive=True)
         )
+    # a tilt of the guide does not rotate a joint on the carriage
+    tilt = map_slide_tilt if len(limb.limb.joints) > 1 else map_displacement
     for axis in guide:
-        name, has_joint = f"thB{number}{axis}", len(limb.limb.joints) > 1
-        if has_joint:
-            maps = map_slide_tilt(name, limb, "guide", f"r{axis}")
-            errors.append(single_error(name, Dimension.ANGLE, 0.0, angle, *maps))
-        else:
-            errors.append(displacement_error(name, limb, "guide", f"r{axis}", angle))
+        name = f"thB{number}{axis}"
+        maps = tilt(name, limb, "guide", f"r{axis}")
+        errors.append(single_error(name, Dimension.ANGLE, 0.0, angle, *maps))
     errors += (
         displacement_error(f"thC{number}{axis}", limb, "joint", f"r{axis}", angle) for axis in joint
     )
@@ -179,145 +179,126 @@ LEFT_OUT = ("thOz", "thU1z")
 """Parameters of the twenty-seven that the twenty-five leave out."""
 
 
-SETS: Mapping[str, tuple[type, str]] = {
-    **RobotRecord.OLDER_KEYS,
-    "parameters": (str, "parameter_set"),
-}
-"""Older keys of both families: a set of parameters by its name."""
-
-
 @dataclass(frozen=True)
-class RuPusPrs(RobotRecord):
-    """The file of an RU-PUS-PRS tracker.
+class CarriageRobot(RobotRecord):
+    """The keys of robots with carriages.
 
     Attributes
     ----------
-    platform_radius, base_radius, rod, post : a, b, l and r [m]. stroke : allowed readings (low,
-        high) [m].
-    error_model : `ideal`, the named parameters, or `complete`. parameter_set : with `ideal`, the
-        set (see the module); `parameters:` with the name of a set means the same.
-    spherical : joints at the rods' ends as perfect `point`s, or with `complete` as `axes` with
-        errors of their own.
+    platform_radius, base_radius, rod : a, b and l [m]. stroke : allowed readings (low, high) [m].
+    error_model : `ideal`, the named parameters, or `complete`.
+    spherical : joints at the upper ends of rods, of a PUS limb at both, as perfect `point`s, or
+        with `complete` as three `axes` with errors of their own.
     tolerances : of lengths and angles.
     """
 
-    family = "ru-pus-prs"
-    OLDER_KEYS: ClassVar[Mapping[str, tuple[type, str]]] = SETS
+    OLDER_KEYS: ClassVar[Mapping[str, tuple[type, str]]] = {
+        **RobotRecord.OLDER_KEYS,
+        "parameters": (str, "parameter_set"),
+    }
 
     platform_radius: Length = 0.0
     base_radius: Length = 0.0
     rod: Length = 0.0
-    post: Length = 0.0
     stroke: tuple[Length, Length] | None = None
     error_model: Literal["ideal", "complete"] = "ideal"
-    parameter_set: Literal["twenty-five", "twenty-seven"] = "twenty-five"
     spherical: Literal["point", "axes"] = "point"
     tolerances: LinkTolerances = field(default_factory=LinkTolerances)
 
+    def join(
+        self, limbs: Sequence[PlacedLimb], errors: Iterator[ErrorModel], *controlled: str
+    ) -> Assembly:
+        """Return limbs under a free platform; errors : of the ideal model."""
+        check_spherical(self.name, self.spherical, self.error_model)
+        spread = self.tolerances.deviations if self.error_model == "complete" else None
+        drives = [name for limb in limbs for name in limb.limb.drives]
+        return self.assemble(
+            limbs,
+            ErrorModel() if spread else join_errors(errors),
+            freedoms=AXES,
+            controlled=controlled,
+            own=(Actuator(name, Dimension.LENGTH, self.stroke) for name in drives),
+            complete=spread,
+        )
+
+
+@dataclass(frozen=True)
+class RuPusPrs(CarriageRobot):
+    """The file of an RU-PUS-PRS tracker.
+
+    Attributes
+    ----------
+    post : its length r [m]. parameter_set : with `ideal`, the set (see the module); `parameters:` with the
+        name of a set means the same.
+    """
+
+    family = "ru-pus-prs"
+
+    post: Length = 0.0
+    parameter_set: Literal["twenty-five", "twenty-seven"] = "twenty-five"
+
     def expand(self) -> Assembly:
         """Return three limbs under a free platform."""
-        check_spherical(self.name, self.spherical, self.error_model)
         a, b, axes = self.platform_radius, self.base_radius, self.spherical == "axes"
         home, spread = self.home.matrix, self.tolerances.deviations
         first = ChainFrames(translate(-b), translate(-a), self.rod, home)
         second = ChainFrames(translate(0.0, b), translate(0.0, a), self.rod, home)
-        limbs = (
-            build_pus_limb("chain1", "q1", first, axes),
-            build_prs_limb("chain2", "q2", second, "x", axes),
-            self._post(),
-        )
-        is_complete, errors = self.error_model == "complete", ErrorModel()
-        if not is_complete:
-            errors = (
-                carriage_errors(limbs[0], 1, first, spread)
-                + carriage_errors(limbs[1], 2, second, spread, joint="yz")
-                + self._post_errors(limbs[2], spread)
-            )
-        return self.assemble(
-            limbs,
-            errors,
-            freedoms=AXES,
-            controlled=("phi", "theta"),
-            own=(Actuator(q, Dimension.LENGTH, self.stroke) for q in ("q1", "q2")),
-            complete=spread if is_complete else None,
-        )
-
-    def _post(self) -> PlacedLimb:
-        """Return revolute joint, link and universal joint; at home all frames are parallel."""
+        # revolute joint, link and universal joint; at home all frames are parallel
         steps = (
             JointPlacement(Joint("pivot", "R"), np.eye(4), EY),
             JointPlacement(Joint("universal1", "R"), translate(0.0, 0.0, self.post), EX),
             JointPlacement(Joint("universal2", "R"), np.eye(4), EY),
         )
-        return place_limb("chain3", steps, np.eye(4), "rigid", np.eye(4))
-
-    def _post_errors(self, post: PlacedLimb, spread: ErrorTolerances) -> ErrorModel:
-        """Return r and the angles of the post."""
-        left_out = LEFT_OUT if self.parameter_set == "twenty-five" else ()
-        return displacement_error(
-            "r", post, "universal1", "z", spread.length, self.post, positive=True
-        ) + join_errors(
-            displacement_error(name, post, element, axis, spread.angle)
-            for name, element, axis in POST_ANGLES
-            if name not in left_out
+        limbs = (
+            build_pus_limb("chain1", "q1", first, axes),
+            build_prs_limb("chain2", "q2", second, "x", axes),
+            place_limb("chain3", steps, np.eye(4), "rigid", np.eye(4)),
         )
+
+        def list_errors() -> Iterator[ErrorModel]:
+            yield carriage_errors(limbs[0], 1, first, spread)
+            yield carriage_errors(limbs[1], 2, second, spread, joint="yz")
+            of_post = limbs[2], "universal1", "z", spread.length, self.post
+            yield displacement_error("r", *of_post, positive=True)
+            left_out = LEFT_OUT if self.parameter_set == "twenty-five" else ()
+            for name, element, axis in POST_ANGLES:
+                if name not in left_out:
+                    yield displacement_error(name, limbs[2], element, axis, spread.angle)
+
+        return self.join(limbs, list_errors(), "phi", "theta")
 
 
 # 3-PRS tripods: three carriages on vertical guides, rods that swing in vertical planes, balls.
 
 
 @dataclass(frozen=True)
-class ThreePrs(RobotRecord):
+class ThreePrs(CarriageRobot):
     """The file of a 3-PRS tripod.
 
     Attributes
     ----------
-    platform_radius, base_radius, rod : a, b and l [m]. stroke : allowed readings (low, high) [m].
-    error_model : `ideal`, the named parameters, or `complete`.
     parameter_set : with `ideal`, the `eleven` identifiable ones of each chain, or all `fourteen`;
         `parameters:` with the name of a set means the same.
-    spherical : upper joints as perfect `point`s, or with `complete` as three `axes` with errors of
-        their own.
-    tolerances : of lengths and angles.
     """
 
     family = "3-prs"
-    OLDER_KEYS: ClassVar[Mapping[str, tuple[type, str]]] = SETS
 
-    platform_radius: Length = 0.0
-    base_radius: Length = 0.0
-    rod: Length = 0.0
-    stroke: tuple[Length, Length] | None = None
-    error_model: Literal["ideal", "complete"] = "ideal"
     parameter_set: Literal["eleven", "fourteen"] = "eleven"
-    spherical: Literal["point", "axes"] = "point"
-    tolerances: LinkTolerances = field(default_factory=LinkTolerances)
 
     def expand(self) -> Assembly:
         """Return three PRS limbs under a free platform."""
-        check_spherical(self.name, self.spherical, self.error_model)
-        limbs, errors = [], ErrorModel()
-        for number in (1, 2, 3):
-            turn = rotate_about(EZ, 2 * np.pi / 3 * (number - 1))
-            base, platform = translate(self.base_radius), translate(self.platform_radius)
-            frames = ChainFrames(turn @ base, turn @ platform, self.rod, self.home.matrix)
-            axes = self.spherical == "axes"
-            limb = build_prs_limb(f"chain{number}", f"q{number}", frames, "y", axes)
-            limbs.append(limb)
-            if self.error_model == "ideal":
-                errors += self._errors(limb, number, frames)
-        return self.assemble(
-            limbs,
-            errors,
-            freedoms=AXES,
-            controlled=("z", "phi", "theta"),
-            own=(Actuator(f"q{number}", Dimension.LENGTH, self.stroke) for number in (1, 2, 3)),
-            complete=self.tolerances.deviations if self.error_model == "complete" else None,
-        )
-
-    def _errors(self, limb: PlacedLimb, number: int, frames: ChainFrames) -> ErrorModel:
-        """Return the named parameters of one chain."""
-        spread = self.tolerances.deviations
+        base, platform = translate(self.base_radius), translate(self.platform_radius)
+        turns = [rotate_about(EZ, 2 * np.pi / 3 * k) for k in range(3)]
+        home, axes, spread = self.home.matrix, self.spherical == "axes", self.tolerances.deviations
+        frames = [ChainFrames(T @ base, T @ platform, self.rod, home) for T in turns]
+        limbs = [
+            build_prs_limb(f"chain{k}", f"q{k}", own, "y", axes) for k, own in enumerate(frames, 1)
+        ]
+        chosen = {"foot": "xyz", "guide": "xyz", "joint": "xyz"}
         if self.parameter_set == "eleven":
-            return carriage_errors(limb, number, frames, spread, joint="xz")
-        return carriage_errors(limb, number, frames, spread, foot="xyz", guide="xyz", joint="xyz")
+            chosen = {"joint": "xz"}
+        errors = (
+            carriage_errors(limb, k, own, spread, **chosen)
+            for k, (limb, own) in enumerate(zip(limbs, frames, strict=True), 1)
+        )
+        return self.join(limbs, errors, "z", "phi", "theta")
