@@ -228,22 +228,6 @@ def count_points(constants: FloatArray) -> int:
     return constants.shape[1] - FIXED
 
 
-def weigh_points(readings: FloatArray, constants: FloatArray, derivative: int = 0) -> FloatArray:
-    """Return the weights of a table's values at readings (..) of one drive, (.., K), or their
-    derivatives by the reading. constants : (2 + K,). Outside its points a table is straight.
-    """
-    points = constants[FIXED:][np.isfinite(constants[FIXED:])]
-    weights = np.zeros((*readings.shape, len(constants) - FIXED))
-    if len(points):
-        spline = make_spline(points.tobytes(), bool(constants[1]))
-        inside = np.clip(readings, points[0], points[-1])
-        inside = np.where(np.isfinite(readings), inside, points[0])
-        slope = spline(inside, 1)
-        chosen = slope if derivative else spline(inside) + slope * (readings - inside)[..., None]
-        weights[..., : len(points)] = chosen
-    return weights
-
-
 @lru_cache
 def make_spline(points: bytes, is_cubic: bool) -> PPoly:
     """Return the weights of the values at points as functions of the reading: broken lines, or
@@ -258,22 +242,20 @@ def make_spline(points: bytes, is_cubic: bool) -> PPoly:
     return PPoly(np.stack([np.diff(values, axis=0) / np.diff(x)[:, None], values[:-1]]), x)
 
 
-def _weigh_tables(r: FloatArray, constants: FloatArray, derivative: int = 0) -> FloatArray:
+def _weigh_tables(r: FloatArray, constants: FloatArray, derivative: bool) -> FloatArray:
     """Return the weights of the values of all tables at readings (t, n, a), (t, n, a, K), or their
-    derivatives by the reading.
+    derivatives by the reading. Outside its points a table is straight.
     """
-    drives = range(len(constants))
-    weights = [weigh_points(r[..., a], constants[a], derivative) for a in drives]
-    return np.stack(weights, axis=-2)
-
-
-def _sum_tables(
-    q: FloatArray, tau: FloatArray, constants: FloatArray, derivative: int = 0
-) -> FloatArray:
-    """Return what tables add to joint values (t, n, a), or to their slopes."""
-    r = split_readings(q, constants)[0]
-    values = select_table(tau, constants)[:, None]
-    return (_weigh_tables(r, constants, derivative) * values).sum(axis=-1)
+    weights = np.zeros((*r.shape, count_points(constants)))
+    for a, row in enumerate(constants):
+        points = row[FIXED:][np.isfinite(row[FIXED:])]
+        if len(points):
+            spline, own = make_spline(points.tobytes(), bool(row[1])), r[..., a]
+            inside = np.where(np.isfinite(own), np.clip(own, points[0], points[-1]), points[0])
+            slope = spline(inside, 1)
+            chosen = slope if derivative else spline(inside) + slope * (own - inside)[..., None]
+            weights[..., a, : len(points)] = chosen
+    return weights
 
 
 def name_terms(actuators: Sequence[Actuator]) -> tuple[str, ...]:
@@ -359,42 +341,44 @@ def term_derivatives(
     """
     end = len(ALL_TERMS) + count_points(constants)
     chosen = range(min(tau.shape[-1], end)) if terms is None else terms
-    triangles = find_triangles(tau)
-    if not len(triangles):
-        return _evaluate_shapes(q, constants, chosen)
-    arm, by_term = _differentiate_triangles(transmit_readings(q, tau, constants), tau, triangles)
-    results = []
-    for term, shape in zip(chosen, _evaluate_shapes(q, constants, chosen), strict=True):
-        column = np.array(np.broadcast_to(shape, (*arm.shape[:2], len(constants))))
-        with np.errstate(divide="ignore", invalid="ignore"):
-            if len(TERMS) <= term < len(TERMS) + MOVABLE:
-                column[..., triangles] = -by_term[..., term - len(TERMS)] / arm
-            else:
-                column[..., triangles] /= arm
-        results.append(column)
-    return results
+    return _divide_by_arms(_evaluate_shapes(q, constants, chosen), q, tau, constants, chosen)
 
 
 def _evaluate_shapes(
-    q: FloatArray, constants: FloatArray, terms: Sequence[int]
+    q: FloatArray, constants: FloatArray, terms: Sequence[int], derivative: bool = False
 ) -> list[FloatArray]:
-    """Return what each of the terms adds per unit to what the transmissions give, (t | 1, n, a); a
-    dimension of a triangle adds nothing.
+    """Return what each of the terms adds per unit to what the transmissions give, (t | 1, n, a), or
+    its derivative by the reading; a dimension of a triangle adds nothing.
     """
     r, approach, load = split_readings(q, constants)
     first, w = len(ALL_TERMS), constants[:, 0]
-    of_points: FloatArray | None = None
-    if any(term >= first for term in terms):
-        of_points = _weigh_tables(r, constants)
+    has_points = any(term >= first for term in terms)
+    of_points = _weigh_tables(r, constants, derivative) if has_points else r[..., None]
 
     def evaluate(term: int) -> FloatArray:
-        if term < len(TERMS):
-            return SHAPES[TERMS[term]].value(r, load if term == COMPLIANCE else approach, w)
-        if of_points is None or term < first:
+        if term >= first:
+            return of_points[..., term - first]
+        if term >= len(TERMS):
             return np.zeros_like(r)
-        return of_points[..., term - first]
+        shape = SHAPES[TERMS[term]]
+        if derivative:
+            return shape.slope(r, w)
+        return shape.value(r, load if term == COMPLIANCE else approach, w)
 
     return [evaluate(term) for term in terms]
+
+
+def _sum_terms(
+    q: FloatArray, tau: FloatArray, constants: FloatArray, derivative: bool = False
+) -> FloatArray:
+    """Return the sum (t, n, a) of all terms but those of triangles, or its derivative by the
+    reading.
+    """
+    first = len(ALL_TERMS)
+    terms = [*range(len(TERMS)), *range(first, first + count_points(constants))]
+    shapes = _evaluate_shapes(q, constants, terms, derivative)
+    parts = (shape * tau[:, None, :, i] for i, shape in zip(terms, shapes, strict=True))
+    return sum(parts, start=np.zeros(1))
 
 
 def joints_from_readings(q: FloatArray, tau: FloatArray, constants: FloatArray) -> FloatArray:
@@ -423,21 +407,32 @@ def joint_slopes(q: FloatArray, tau: FloatArray, constants: FloatArray) -> Float
     """Return d joint / d reading (t, n, a), of plain gains (t | 1, 1, a); of summed drives d sum /
     d reading.
     """
-    return _divide_by_arms(evaluate_slopes(q, tau, constants), q, tau, constants)
+    return _divide_by_arms([evaluate_slopes(q, tau, constants)], q, tau, constants)[0]
 
 
 def _divide_by_arms(
-    slopes: FloatArray, q: FloatArray, tau: FloatArray, constants: FloatArray
-) -> FloatArray:
-    """Return slopes (t | 1, n | 1, a) of angles, of those of the lengths of triangles."""
+    slopes: Sequence[FloatArray],
+    q: FloatArray,
+    tau: FloatArray,
+    constants: FloatArray,
+    terms: Sequence[int] = (),
+) -> list[FloatArray]:
+    """Return slopes (t | 1, n | 1, a) of angles, of those of the lengths of triangles; terms : by
+    which the slopes are.
+    """
     triangles = find_triangles(tau)
     if not len(triangles):
-        return slopes
-    arm, _ = _differentiate_triangles(transmit_readings(q, tau, constants), tau, triangles)
-    slopes = np.array(np.broadcast_to(slopes, (*arm.shape[:2], len(constants))))
+        return list(slopes)
+    angles = transmit_readings(q, tau, constants)[..., triangles]
+    arm, by_term = differentiate_length(angles, _select_triangles(tau, triangles))
+    columns = [np.array(np.broadcast_to(s, (*arm.shape[:2], len(constants)))) for s in slopes]
+    for term, column in zip(terms, columns, strict=False):
+        if len(TERMS) <= term < len(TERMS) + MOVABLE:
+            column[..., triangles] = -by_term[..., term - len(TERMS)]
     with np.errstate(divide="ignore", invalid="ignore"):
-        slopes[..., triangles] /= arm
-    return slopes
+        for column in columns:
+            column[..., triangles] /= arm
+    return columns
 
 
 def differentiate_by_readings(q: FloatArray, tau: FloatArray, constants: FloatArray) -> FloatArray:
@@ -449,7 +444,7 @@ def differentiate_by_readings(q: FloatArray, tau: FloatArray, constants: FloatAr
     by_readings = slopes[..., None] * (constants[:, SOURCE, None] == columns)
     if (constants[:, LOADED] < 0).all():
         return by_readings
-    by_load = _divide_by_arms(tau[:, None, :, COMPLIANCE], q, tau, constants)
+    (by_load,) = _divide_by_arms([tau[:, None, :, COMPLIANCE]], q, tau, constants)
     return by_readings + by_load[..., None] * (constants[:, LOADED, None] == columns)
 
 
@@ -569,46 +564,24 @@ def measure_excess(q: FloatArray, tau: FloatArray, constants: FloatArray) -> Flo
 
 def evaluate_sums(q: FloatArray, tau: FloatArray, constants: FloatArray) -> FloatArray:
     """Return the joint values (t, n, a) of readings; of triangle drives lengths, else sums."""
-    has_tables = count_points(constants) > 0
-    if not tau[..., 2 : len(TERMS)].any() and not has_tables:
+    if not tau[..., 2 : len(TERMS)].any() and not count_points(constants):
         readings = split_readings(q, constants)[0]
         if len(tau) in (1, len(q)) and (tau[..., :2] == (0.0, 1.0)).all():
             return readings + 0.0  # no offset and no gain: one pass, with the same bits
         return tau[:, None, :, 0] + readings * tau[:, None, :, 1]
-    shapes = _evaluate_shapes(q, constants, range(len(TERMS)))
-    values = sum(
-        (shapes[i] * tau[:, None, :, i] for i in range(1, len(TERMS))),
-        start=shapes[0] * tau[:, None, :, 0],
-    )
-    return values + _sum_tables(q, tau, constants) if has_tables else values
+    return _sum_terms(q, tau, constants)
 
 
 def evaluate_slopes(q: FloatArray, tau: FloatArray, constants: FloatArray) -> FloatArray:
     """Return d joint / d reading; of triangle drives d length / d reading."""
-    has_tables = count_points(constants) > 0
-    if not tau[..., 2:7].any() and not has_tables:
+    if not tau[..., 2:7].any() and not count_points(constants):
         return tau[:, None, :, 1]
-    r = split_readings(q, constants)[0]
-    slopes = sum(
-        (
-            shape.slope(r, constants[:, 0]) * tau[:, None, :, i]
-            for i, shape in enumerate(SHAPES.values())
-        ),
-        start=np.zeros(1),
-    )
-    return slopes + _sum_tables(q, tau, constants, 1) if has_tables else slopes
+    return _sum_terms(q, tau, constants, derivative=True)
 
 
 def _select_triangles(tau: FloatArray, triangles: IntArray) -> FloatArray:
     """Return the terms (t | 1, 1, k, 10) of triangles."""
     return tau[:, None, triangles, len(TERMS) : len(ALL_TERMS)]
-
-
-def _differentiate_triangles(
-    joints: FloatArray, tau: FloatArray, triangles: IntArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return the derivatives of lengths by angles (t, n, k) and by movable terms (t, n, k, 8)."""
-    return differentiate_length(joints[..., triangles], _select_triangles(tau, triangles))
 
 
 def find_reversed(joints: FloatArray, tau: FloatArray, triangles: IntArray) -> BoolArray:

@@ -228,8 +228,8 @@ class RuPusPrs(CarriageRobot):
 
     Attributes
     ----------
-    post : its length r [m]. parameter_set : with `ideal`, the set (see the module); `parameters:` with the
-        name of a set means the same.
+    post : its length r [m]. parameter_set : with `ideal`, the set (see the module); `parameters:`
+        with the name of a set means the same.
     """
 
     family = "ru-pus-prs"
