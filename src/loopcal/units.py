@@ -56,6 +56,17 @@ Pixel = Annotated[float, Dimension.PIXEL]
 
 
 @dataclass(frozen=True)
+class DimensionOf:
+    """A dimension that the class of a record states under a name, for records that differ in it."""
+
+    name: str
+
+
+Given = Annotated[float, DimensionOf("GIVEN")]
+Reading = Annotated[float, DimensionOf("READING")]
+
+
+@dataclass(frozen=True)
 class Unit:
     """A unit, with its symbol in files, e.g. "mm": `SI value = value * factor_to_si`."""
 

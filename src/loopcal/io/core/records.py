@@ -25,7 +25,7 @@ from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 from loopcal.errors import FileError, UnitError, suggest_names
 from loopcal.io.core.yaml_file import Location, YamlFile, name_location, refuse_unknown_keys
 from loopcal.plain_text import quote
-from loopcal.units import Dimension, Unit, find_unit, list_symbols, to_si
+from loopcal.units import Dimension, DimensionOf, Unit, find_unit, list_symbols, to_si
 
 T = TypeVar("T")
 Units = Mapping[Dimension, Unit]
@@ -81,7 +81,20 @@ def read_units(file: YamlFile) -> dict[Dimension, Unit]:
 def get_field_types(record: type) -> Mapping[str, Any]:
     """Return key -> annotation of the fields that a record takes from a file."""
     hints = typing.get_type_hints(record, include_extras=True)
-    return {_key(f.name): hints[f.name] for f in dataclasses.fields(record) if f.init}
+    own = (f.name for f in dataclasses.fields(record) if f.init)
+    return {_key(name): _state_dimension(hints[name], record) for name in own}
+
+
+def _state_dimension(annotation: Any, record: type) -> Any:
+    """Return an annotation with the dimensions that the class of its record states."""
+    origin, arguments = get_origin(annotation), get_args(annotation)
+    if origin is Annotated:
+        stated = isinstance(arguments[1], DimensionOf)
+        return Annotated[float, getattr(record, arguments[1].name)] if stated else annotation
+    if origin is None or origin is Literal:
+        return annotation
+    parts = tuple(_state_dimension(argument, record) for argument in arguments)
+    return Union[parts] if origin is types.UnionType else origin[parts]  # noqa: UP007
 
 
 def _key(name: str) -> str:

@@ -25,6 +25,7 @@ from loopcal.mechanism.families.placement import (
     Point,
     RatioTolerance,
     RecordError,
+    ToleranceRecord,
     join_errors,
     single_error,
     standard_deviation,
@@ -43,10 +44,9 @@ from loopcal.mechanism.transmission import (
     nominal_terms,
 )
 from loopcal.typing import FloatArray
-from loopcal.units import Angle, Dimension, Length, Ratio
+from loopcal.units import Angle, Dimension, Given, Length, Ratio, Reading
 
-# Records. Those that differ in a dimension only are classes of their own, because the reader of
-# files takes the unit of a number from its annotation.
+# Records. The reader of files takes the unit of a number from its annotation.
 
 
 ON_AXIS = 1e-9
@@ -97,76 +97,43 @@ class Triangle:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReadsLength:
-    """A drive whose reading is a length; `period` is the reading per turn of the harmonics, `sigma`
-    its standard deviation.
-    """
-
-    reads: Literal["length"]
-    stroke: tuple[Length, Length] | None = None
-    period: Length = 0.0
-    sigma: Length | None = None
-
-
-@dataclass(frozen=True, kw_only=True)
-class ReadsAngle:
-    """A drive whose reading is an angle; keys as those of a length."""
-
-    reads: Literal["angle"]
-    stroke: tuple[Angle, Angle] | None = None
-    period: Angle = 0.0
-    sigma: Angle | None = None
-
-
-@dataclass(frozen=True, kw_only=True)
-class GivesLength:
-    """The known terms of a drive of a slide or rod, and what of it is to be identified.
+class DriveRecord:
+    """What every drive can state: its reading, with `stroke`, `period` per turn of the harmonics
+    and standard deviation `sigma`; the known terms of what it gives, and which are `unknown`.
 
     joint value = offset + scale * reading + curve * (reading / reach)^2 + harmonics of the period +
-    backlash * direction / 2 + compliance * load, where reach is the end of the stroke that is
-    farther from zero, and the load is the force [N] that lengthens the drive. `unknown` names terms
-    to identify, with the tolerance `length`, that of the compliance is `compliances`.
+    backlash * direction / 2 + compliance * load + table, where reach is the end of the stroke that
+    is farther from zero, and the load is the force [N] that lengthens the drive, or the moment [Nm]
+    of a rotary one. Unknown terms have the tolerance `length` or `angle`, the compliance has
+    `compliances`. Between the rows [reading, value] of the `table` are straight lines or splines
+    (`interpolation`); its unknown values are table1, table2, .., or table for all.
     """
 
-    offset: Length = 0.0
-    curve: Length = 0.0
-    backlash: Length = 0.0
-    sin1: Length = 0.0
-    cos1: Length = 0.0
-    sin2: Length = 0.0
-    cos2: Length = 0.0
-    compliance: Length = 0.0
-    compliances: LengthTolerance | None = None
-    unknown: tuple[str, ...] = ()
-    length: LengthTolerance | None = None
+    READING: ClassVar[Dimension] = Dimension.LENGTH
+    GIVEN: ClassVar[Dimension] = Dimension.LENGTH
 
-
-@dataclass(frozen=True, kw_only=True)
-class GivesAngle:
-    """The known terms of a drive of a rotary joint; keys as those of a slide, with a load in
-    Nm.
-    """
-
-    offset: Angle = 0.0
-    curve: Angle = 0.0
-    backlash: Angle = 0.0
-    sin1: Angle = 0.0
-    cos1: Angle = 0.0
-    sin2: Angle = 0.0
-    cos2: Angle = 0.0
-    compliance: Angle = 0.0
-    compliances: AngleTolerance | None = None
-    unknown: tuple[str, ...] = ()
-    angle: AngleTolerance | None = None
-
-
-@dataclass(frozen=True, kw_only=True)
-class Interpolation:
-    """How a `table`, rows of a reading and a value that is added to the joint value, goes from
-    point to point. Unknown values are table1, table2, .., or table for all.
-    """
-
+    stroke: tuple[Reading, Reading] | None = None
+    period: Reading = 0.0
+    sigma: Reading | None = None
+    offset: Given = 0.0
+    curve: Given = 0.0
+    backlash: Given = 0.0
+    sin1: Given = 0.0
+    cos1: Given = 0.0
+    sin2: Given = 0.0
+    cos2: Given = 0.0
+    compliance: Given = 0.0
+    table: tuple[tuple[Reading, Given], ...] = ()
     interpolation: Literal["linear", "cubic"] = "linear"
+    unknown: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class GivesLength(DriveRecord):
+    """The tolerances of a drive that gives a length."""
+
+    length: LengthTolerance | None = None
+    compliances: LengthTolerance | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -189,21 +156,26 @@ class Sum:
 
 
 @dataclass(frozen=True, kw_only=True)
-class LengthDrive(Interpolation, Sum, Gain, GivesLength, ReadsLength):
+class LengthDrive(Sum, Gain, GivesLength):
     """A drive of a slide or rod whose reading is a length."""
 
-    table: tuple[tuple[Length, Length], ...] = ()
+    reads: Literal["length"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class AngleDrive(Interpolation, Sum, Gain, GivesAngle, ReadsAngle):
+class AngleDrive(Sum, Gain, DriveRecord):
     """A drive of a rotary joint whose reading is an angle."""
 
-    table: tuple[tuple[Angle, Angle], ...] = ()
+    READING: ClassVar[Dimension] = Dimension.ANGLE
+    GIVEN: ClassVar[Dimension] = Dimension.ANGLE
+
+    reads: Literal["angle"]
+    angle: AngleTolerance | None = None
+    compliances: AngleTolerance | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
-class SpoolDrive(Interpolation, Sum, GivesLength, ReadsAngle):
+class SpoolDrive(Sum, GivesLength):
     """A drive whose reading is an angle and moves a length.
 
     joint value = offset + radius * reading + buildup * reading^2 / (4 pi) + .. `radius` is the
@@ -212,26 +184,30 @@ class SpoolDrive(Interpolation, Sum, GivesLength, ReadsAngle):
     are `radii` and `buildups`.
     """
 
+    READING: ClassVar[Dimension] = Dimension.ANGLE
+
+    reads: Literal["angle"]
     radius: Length
     buildup: Length = 0.0
     radii: LengthTolerance | None = None
     buildups: LengthTolerance | None = None
-    table: tuple[tuple[Angle, Length], ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
-class ScrewDrive(Interpolation, Sum, GivesLength, ReadsAngle):
+class ScrewDrive(Sum, GivesLength):
     """A screw whose reading is its angle: it moves by `lead` in one turn, negative for a left-hand
     one, with the tolerance `leads`.
     """
 
+    READING: ClassVar[Dimension] = Dimension.ANGLE
+
+    reads: Literal["angle"]
     lead: Length
     leads: LengthTolerance | None = None
-    table: tuple[tuple[Angle, Length], ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
-class TriangleDrive(Interpolation, Gain, GivesLength, ReadsLength):
+class TriangleDrive(Gain, GivesLength):
     """A linear actuator that turns a revolute joint through two anchors.
 
     The distance of the anchors is what a length drive gives. `unknown` may also name dimensions of
@@ -242,7 +218,6 @@ class TriangleDrive(Interpolation, Gain, GivesLength, ReadsLength):
     reads: Literal["length"] = "length"
     triangle: Triangle
     angle: AngleTolerance | None = None
-    table: tuple[tuple[Length, Length], ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -284,41 +259,46 @@ class LoadFrame:
 
 
 @dataclass(frozen=True, kw_only=True)
-class AngleCoupling(Sum):
+class CouplingRecord(Sum):
+    """What every coupling can state."""
+
+    GIVEN: ClassVar[Dimension] = Dimension.LENGTH
+
+    offset: Given = 0.0
+    condition: str = ""
+    slope: Given = 0.0
+    unknown: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class AngleCoupling(CouplingRecord):
     """Gears, a belt or a differential between rotary joints: the sum of weight * joint value is
     the `offset`. Joints are drives, or passive joints `limb.joint`; `unknown` names weights and
     offset. With a `condition` it is offset + slope * (condition - reference), the slope in units
     of the sum per degC or second.
     """
 
+    GIVEN: ClassVar[Dimension] = Dimension.ANGLE
+
     of: Literal["angle"] = "angle"
-    offset: Angle = 0.0
-    condition: str = ""
-    slope: Angle = 0.0
-    unknown: tuple[str, ...] = ()
     angle: AngleTolerance | None = None
     slopes: AngleTolerance | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
-class LengthCoupling(Sum):
+class LengthCoupling(CouplingRecord):
     """A coupling of slides, and of rotary joints by a `radius` (joint -> length per radian), as of
     a pinion on a rack. Unknown radii have the tolerance `radii`.
     """
 
     of: Literal["length"]
     radius: Mapping[str, Length] = field(default_factory=dict)
-    offset: Length = 0.0
-    condition: str = ""
-    slope: Length = 0.0
-    unknown: tuple[str, ...] = ()
     length: LengthTolerance | None = None
     slopes: LengthTolerance | None = None
     radii: LengthTolerance | None = None
 
 
 Coupling = AngleCoupling | LengthCoupling
-Tolerance = LengthTolerance | AngleTolerance | RatioTolerance | None
 
 
 # Rows of driven joints: drives and couplings at their joints, and their unknowns.
@@ -335,7 +315,7 @@ class Term(NamedTuple):
 
     dimension: Dimension
     nominal: float
-    tolerance: Tolerance
+    tolerance: ToleranceRecord | None
     maps: Mapping[str, float]
     positive: bool = False
 
@@ -372,7 +352,7 @@ class PlacedRow:
     @property
     def dimension(self) -> Dimension:
         """Dimension of what it gives: the joint, the sum, the length of a triangle."""
-        raise NotImplementedError
+        return self.drive.GIVEN
 
     @property
     def sense(self) -> float:
@@ -409,14 +389,14 @@ class SumPart(NamedTuple):
     items: Iterable[tuple[str, float]]
     turns: bool
     dimension: Dimension
-    tolerance: Tolerance
+    tolerance: ToleranceRecord | None
 
 
 def list_parts(stated: Drive | Coupling) -> tuple[SumPart, ...]:
     """Return the parts of the sum of a drive or coupling, none of a triangle drive."""
     if isinstance(stated, TriangleDrive):
         return ()
-    turns, ratio = isinstance(stated, AngleDrive | AngleCoupling), Dimension.RATIO
+    turns, ratio = stated.GIVEN is Dimension.ANGLE, Dimension.RATIO
     parts = (SumPart("weight", stated.sum.items(), turns, ratio, stated.weights),)
     if isinstance(stated, LengthCoupling):
         radii = stated.radius.items()
@@ -438,12 +418,6 @@ class PlacedDrive(PlacedRow):
     drive: Drive
     joint: DrivenJoint
     own: Actuator
-
-    @property
-    def dimension(self) -> Dimension:
-        """Dimension of the joint, or of the length of a triangle."""
-        is_angle = self.joint.turns and not isinstance(self.drive, TriangleDrive)
-        return Dimension.ANGLE if is_angle else Dimension.LENGTH
 
     @property
     def sense(self) -> float:
@@ -473,7 +447,7 @@ class PlacedDrive(PlacedRow):
 
     @property
     def _is_like_own(self) -> bool:
-        return self.own.dimension.value == self.drive.reads
+        return self.own.dimension is self.drive.READING
 
     @property
     def law(self) -> dict[str, float]:
@@ -493,7 +467,7 @@ class PlacedDrive(PlacedRow):
             terms |= place_triangle(self.name, drive, self.joint.rotation, self.joint.start)
         return Actuator(
             self.name,
-            Dimension(drive.reads),
+            drive.READING,
             self.stroke,
             terms,
             drive.period,
@@ -530,7 +504,7 @@ class PlacedDrive(PlacedRow):
         units = {"curve": 1 / reach**2 if 0.0 < reach < np.inf else np.nan}
         numbers = {t: getattr(drive, t) for t in ("offset", "curve", "backlash", *HARMONICS)}
         numbers |= {f"{TABLE}{k}": value for k, (_, value) in enumerate(drive.table, 1)}
-        tolerance = drive.angle if isinstance(drive, AngleDrive) else drive.length
+        tolerance = getattr(drive, own.value)
         terms = {
             name: Term(own, number, tolerance, {name: sense * units.get(name, 1.0)})
             for name, number in numbers.items()
@@ -552,11 +526,6 @@ class PlacedCoupling(PlacedRow):
     reference: float = 0.0
 
     @property
-    def dimension(self) -> Dimension:
-        """Dimension of the sum."""
-        return Dimension(self.drive.of)
-
-    @property
     def actuator(self) -> Actuator:
         """The row of joints, whose only reading is a condition."""
         slope, column = self.drive.slope, self.drive.condition
@@ -567,7 +536,7 @@ class PlacedCoupling(PlacedRow):
     def list_terms(self) -> dict[str, Term]:
         """Return offset, slope, weights and radii by the names that a file gives them."""
         coupling, own = self.drive, self.dimension
-        spread = coupling.angle if isinstance(coupling, AngleCoupling) else coupling.length
+        spread = getattr(coupling, own.value)
         terms = {"offset": Term(own, coupling.offset, spread, {"offset": 1.0})}
         if coupling.condition:
             per = own.per(get_condition_dimension(coupling.condition))
@@ -705,7 +674,7 @@ def place_rows(
         joint = joints[next(iter(names.values()), name)]
         plain = AngleDrive(reads="angle") if joint.turns else LengthDrive(reads="length")
         drive = plain if key is None else stated[key]
-        from_family = base.get(name) or Actuator(name, Dimension(drive.reads))
+        from_family = base.get(name) or Actuator(name, drive.READING)
         drives[name] = PlacedDrive(name, drive, names, joint, from_family)
         _check_drive(drives[name])
     groups = {joint.stated for joint in joints.values() if not joint.is_passive}
@@ -896,7 +865,7 @@ def _check_drive(placed: PlacedDrive) -> None:
     stated or unknown and cannot be (DriveError).
     """
     drive, name, turns = placed.drive, placed.name, placed.joint.turns
-    if turns != isinstance(drive, AngleDrive | TriangleDrive):
+    if turns != (drive.GIVEN is Dimension.ANGLE or isinstance(drive, TriangleDrive)):
         motion, allowed = (
             ("turns", "reads: angle without a radius, or a triangle")
             if turns

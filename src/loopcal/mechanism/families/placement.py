@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple
+from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
 
@@ -28,7 +28,7 @@ from loopcal.mechanism.assembly import (
 )
 from loopcal.parameters import Parameter
 from loopcal.typing import FloatArray
-from loopcal.units import SD_RANGE, Angle, Dimension, Length, Ratio, is_sd
+from loopcal.units import SD_RANGE, Angle, Dimension, Given, Length, is_sd
 
 # Limbs with joints about any axis, placed one after the other, in the form of the engine.
 
@@ -424,32 +424,35 @@ class PoseRecord:
 
 
 @dataclass(frozen=True)
-class LengthTolerance:
+class ToleranceRecord:
+    """Tolerance of a number: sd, or limits of a uniform error (sd = limits / sqrt 3)."""
+
+    GIVEN: ClassVar[Dimension] = Dimension.RATIO
+
+    sd: Given | None = None
+    limits: Given | None = None
+
+
+@dataclass(frozen=True)
+class LengthTolerance(ToleranceRecord):
     """Tolerance of a length: sd, or limits of a uniform error (sd = limits / sqrt 3)."""
 
-    sd: Length | None = None
-    limits: Length | None = None
+    GIVEN = Dimension.LENGTH
 
 
 @dataclass(frozen=True)
-class AngleTolerance:
+class AngleTolerance(ToleranceRecord):
     """Tolerance of an angle: sd, or limits of a uniform error (sd = limits / sqrt 3)."""
 
-    sd: Angle | None = None
-    limits: Angle | None = None
+    GIVEN = Dimension.ANGLE
 
 
 @dataclass(frozen=True)
-class RatioTolerance:
+class RatioTolerance(ToleranceRecord):
     """Tolerance of a ratio: sd, or limits of a uniform error (sd = limits / sqrt 3)."""
 
-    sd: Ratio | None = None
-    limits: Ratio | None = None
 
-
-def standard_deviation(
-    tolerance: LengthTolerance | AngleTolerance | RatioTolerance | None, name: str
-) -> float | None:
+def standard_deviation(tolerance: ToleranceRecord | None, name: str) -> float | None:
     """Return the standard deviation of a tolerance [SI], None without; MechanismError if wrong."""
     if tolerance is None:
         return None
@@ -457,7 +460,7 @@ def standard_deviation(
         raise MechanismError(f"the tolerance of {name} must give exactly one of sd and limits")
     stated = tolerance.sd if tolerance.sd is not None else tolerance.limits or 0.0
     if not is_sd(stated):
-        unit = {LengthTolerance: " m", AngleTolerance: " rad", RatioTolerance: ""}[type(tolerance)]
+        unit = {Dimension.LENGTH: " m", Dimension.ANGLE: " rad"}.get(tolerance.GIVEN, "")
         raise MechanismError(
             f"the tolerance of {name} is {stated:g}{unit}, but must be greater than zero "
             f"({SD_RANGE}), or left out"

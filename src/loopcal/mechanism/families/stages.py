@@ -61,7 +61,7 @@ from loopcal.mechanism.families.records import (
     NamedParameter,
     RobotRecord,
 )
-from loopcal.units import Angle, Dimension, Length, Ratio
+from loopcal.units import Dimension, Given, Ratio
 
 # The assembly of a chain: those of its stages, with the stage before each name.
 
@@ -199,16 +199,14 @@ LIMB, LINK = "serial", "joint"
 """Names of the limb and of the joint of a serial stage."""
 
 
-@dataclass(frozen=True)
-class SerialRotation:
-    """A driven rotary joint as a stage of its own.
+@dataclass(frozen=True, kw_only=True)
+class SerialJoint:
+    """What every serial joint can state.
 
     Attributes
     ----------
     at : where it is on the platform that carries it. axis : direction in the placed frame.
     tip : platform of this stage in the placed frame, at joint value zero.
-    drive : name of its actuator; default: the name of the stage. Or a linear actuator that turns
-        it, `{triangle: ..}`, which states its own stroke, gain, sigma and unknowns.
     start : reading at home; with a triangle, angle of the joint at home. stroke : allowed readings.
     gain : joint value per reading.
     sigma : standard deviation of the reading.
@@ -217,15 +215,15 @@ class SerialRotation:
     length, angle, ratio : tolerances of these unknowns.
     """
 
-    kind: Literal["R"]
+    GIVEN: ClassVar[Dimension] = Dimension.LENGTH
+
     at: Place = ORIGIN
     axis: Axis = "z"
     tip: Place = ORIGIN
-    drive: str | NamedTriangleDrive = ""
-    start: Angle = 0.0
-    stroke: tuple[Angle, Angle] | None = None
+    start: Given = 0.0
+    stroke: tuple[Given, Given] | None = None
     gain: Ratio = 1.0
-    sigma: Angle | None = None
+    sigma: Given | None = None
     errors: tuple[JointError, ...] = ()
     platform_errors: tuple[Freedom, ...] = ()
     length: LengthTolerance | None = None
@@ -233,24 +231,33 @@ class SerialRotation:
     ratio: RatioTolerance | None = None
 
 
-@dataclass(frozen=True)
-class SerialSlide:
-    """A driven slide as a stage of its own; keys as those of a rotary joint."""
+@dataclass(frozen=True, kw_only=True)
+class SerialRotation(SerialJoint):
+    """A driven rotary joint as a stage of its own.
+
+    Attributes
+    ----------
+    drive : name of its actuator; default: the name of the stage. Or a linear actuator that turns
+        it, `{triangle: ..}`, which states its own stroke, gain, sigma and unknowns.
+    """
+
+    GIVEN: ClassVar[Dimension] = Dimension.ANGLE
+
+    kind: Literal["R"]
+    drive: str | NamedTriangleDrive = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SerialSlide(SerialJoint):
+    """A driven slide as a stage of its own.
+
+    Attributes
+    ----------
+    drive : name of its actuator; default: the name of the stage.
+    """
 
     kind: Literal["P"]
-    at: Place = ORIGIN
-    axis: Axis = "z"
-    tip: Place = ORIGIN
     drive: str = ""
-    start: Length = 0.0
-    stroke: tuple[Length, Length] | None = None
-    gain: Ratio = 1.0
-    sigma: Length | None = None
-    errors: tuple[JointError, ...] = ()
-    platform_errors: tuple[Freedom, ...] = ()
-    length: LengthTolerance | None = None
-    angle: AngleTolerance | None = None
-    ratio: RatioTolerance | None = None
 
 
 @dataclass(frozen=True)
@@ -380,11 +387,10 @@ def expand_joint(
     assert isinstance(drive, str)
     if triangle is not None:
         _refuse_terms_beside_triangle(record, drive)
-    dimension = Dimension.ANGLE if isinstance(record, SerialRotation) else Dimension.LENGTH
     joint = Joint(LINK, record.kind, drive, start=record.gain * record.start)
     step = JointPlacement(joint, matrix_from_place(record.at), axis_vector(record.axis))
     limb = place_limb(LIMB, (step,), matrix_from_place(record.tip), "rigid", np.eye(4))
-    own = Actuator(drive, dimension, record.stroke, {"gain": record.gain}, sigma=record.sigma)
+    own = Actuator(drive, record.GIVEN, record.stroke, {"gain": record.gain}, sigma=record.sigma)
     stated = _select_drives(drives, [drive])
     if triangle is not None and stated:
         raise RecordError(
@@ -431,10 +437,10 @@ def _joint_error(
         gain = LinearMap(error, Address(drive, "transmission", error))
         sd = standard_deviation(record.ratio, error)
         return single_error(error, Dimension.RATIO, record.gain, sd, gain, positive=True)
-    turns = record.kind == "R" if error == "offset" else error in AXES[:3]
+    turns = record.GIVEN is Dimension.ANGLE if error == "offset" else error in AXES[:3]
     sd = standard_deviation(record.angle if turns else record.length, error)
     if error == "offset":
-        return offset_error(error, drive, Dimension.ANGLE if turns else Dimension.LENGTH, 0.0, sd)
+        return offset_error(error, drive, record.GIVEN, 0.0, sd)
     place = limb.placements[LINK]
     at = 0.0 if turns else float((place[:3, :3].T @ place[:3, 3])["xyz".index(error)])
     return displacement_error(error, limb, LINK, error, sd, at)
