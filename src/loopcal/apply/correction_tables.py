@@ -25,10 +25,10 @@ from loopcal.errors import DataError
 from loopcal.findings import Finding, Severity, report_finding
 from loopcal.geometry import wrap_angle
 from loopcal.mechanism.model import Mechanism
-from loopcal.mechanism.platform_coordinates import TILT, get_dimension, read_coordinates
+from loopcal.mechanism.platform_coordinates import POSITION, TILT, get_dimension, read_coordinates
 from loopcal.mechanism.solutions import forward, inverse, list_commanded
 from loopcal.mechanism.workspace import draw_coordinates, sample_workspace, workspace_ranges
-from loopcal.typing import BoolArray, FloatArray
+from loopcal.typing import FloatArray
 from loopcal.units import Dimension
 
 What = Literal["commands", "height", "readings"]
@@ -38,8 +38,7 @@ STEPS = 5  # of the fixed-point iteration: each leaves the slope of the map, far
 CHECKS = 2000  # points between nodes at which the rest is found
 FEWEST = 3  # nodes along an axis: with the ends alone, a symmetric error looks like none
 ENOUGH = 1.2  # times the least rest of any number of nodes, at which more nodes do not help
-SMALL = 0.05  # of the limit: a table that leaves less of a reading needs no more nodes
-SMOOTHING = 1e-3  # weight of the bend at a node, of a pose near it
+LIGHT = 1e-3  # weight of a coarser table at a node, of a pose near it
 ROUNDING = 1e-9  # errors below this share of the robot's size are rounding
 
 
@@ -70,36 +69,34 @@ class _Machine(NamedTuple):
     controller: Mechanism
     corrected: list[int]
 
-    @property
-    def are_lengths(self) -> BoolArray:
-        """Which controlled coordinates (c,) are lengths."""
-        return np.array([get_dimension(n) is Dimension.LENGTH for n in self.robot.controlled])
-
-    def miss(self, targets: FloatArray, commands: FloatArray) -> FloatArray:
+    def lead(self, targets: FloatArray, commands: FloatArray) -> FloatArray:
         """Return how far (n, c) the robot stops from targets at commands (n, c), NaN where the
         machine does not get to one.
         """
         led = inverse(self.controller, commands)
-        return self.stop(targets, led.q[:, list_commanded(self.controller)], led.converged)
+        readings = np.where(led.converged[:, None], led.q, np.nan)
+        return self.stop(targets, readings[:, list_commanded(self.controller)])
 
-    def stop(self, targets: FloatArray, readings: FloatArray, usable: BoolArray) -> FloatArray:
+    def stop(self, targets: FloatArray, readings: FloatArray) -> FloatArray:
         """Return how far (n, c) the robot stops from targets at readings (n, a)."""
-        reached = forward(self.robot, np.where(usable[:, None], readings, 0.0))
+        reached = forward(self.robot, np.nan_to_num(readings))
         found = read_coordinates(reached.T, self.robot.controlled) - targets
-        found = np.where(self.are_lengths, found, wrap_angle(found))
-        return np.where((usable & reached.converged)[:, None], found, np.nan)
+        found = np.where(np.isin(self.robot.controlled, POSITION), found, wrap_angle(found))
+        usable = reached.converged & np.isfinite(readings).all(axis=1)
+        return np.where(usable[:, None], found, np.nan)
 
-    def sizes(self, misses: FloatArray, columns: Sequence[int]) -> FloatArray:
-        """Return the error in position, and in orientation (n, 2) [m, rad] of some columns."""
-        of = np.zeros(len(self.are_lengths), bool)
-        of[list(columns)] = True
-        squares = misses**2
-        lengths = squares[:, of & self.are_lengths].sum(axis=1)
-        return np.sqrt(np.column_stack([lengths, squares[:, of & ~self.are_lengths].sum(axis=1)]))
+    def measure(self, misses: FloatArray, columns: Sequence[int]) -> tuple[float, float]:
+        """Return the largest error in position and in orientation [m, rad] of some columns."""
+        of = np.isin(np.arange(misses.shape[1]), columns)
+        is_length = np.isin(self.robot.controlled, POSITION)
+        parts = (misses[:, of & is_length], misses[:, of & ~is_length])
+        position, angle = (float(np.linalg.norm(p, axis=1).max(initial=0.0)) for p in parts)
+        return position, angle
 
-    def weigh(self, misses: FloatArray) -> FloatArray:
-        """Return the larger of both (n,) [m], an angle by its arc at the robot's size."""
-        return (self.sizes(misses, self.corrected) * [1.0, self.robot.size]).max(axis=1)
+    def weigh(self, misses: FloatArray) -> float:
+        """Return the larger of both [m], an angle by its arc at the robot's size."""
+        position, angle = self.measure(misses, self.corrected)
+        return max(position, self.robot.size * angle)
 
 
 def make_tables(
@@ -137,20 +134,20 @@ def make_tables(
         targets = sample_workspace(robot, 4 * CHECKS).coordinates
     else:
         targets = place(draw_coordinates(np.random.default_rng(0), tuple(axes), ranges, CHECKS))
-    before = machine.miss(targets, targets)
+    before = machine.lead(targets, targets)
     targets, before = (rows[np.isfinite(before).all(axis=1)] for rows in (targets, before))
-    largest = float(machine.weigh(before).max(initial=0.0))
+    largest = machine.weigh(before)
     if largest < ROUNDING * robot.size:
         raise DataError(report_finding("files.nothing-to-correct", robot=robot.name))
     limit = SHARE * largest if limit is None else limit
     if size.what == "readings":
-        tables, after = _fit_readings(machine, targets, limit, size)
+        tables, after = _fit_readings(machine, targets, limit, size.most_along)
     else:
         spans = [ranges[name] for name in axes]
         nodes, grid, after = _choose_grid(machine, place, targets[:, places], spans, limit, size)
         values = dict(zip(moved, np.moveaxis(grid, -1, 0), strict=True))
-        tables = (CorrectionTable(dict(zip(axes, nodes, strict=True)), values),)
-    return tables, tuple(_report(machine, size, tables, (before, after), limit))
+        tables = [CorrectionTable(dict(zip(axes, nodes, strict=True)), values)]
+    return tuple(tables), tuple(_report(machine, size, tables, (before, after), limit))
 
 
 def _report(
@@ -161,27 +158,21 @@ def _report(
     limit: float,
 ) -> list[Finding]:
     """Return how large errors were, what remains, and what no table of this sort corrects."""
-    robot, data = machine.robot, dict[str, Any](angle_before=0, angle_after=0, angle_limit=0)
-    for key, rows in zip(("before", "after"), misses, strict=True):
-        position, angle = machine.sizes(rows, machine.corrected).max(axis=0).tolist()
-        data[key] = robot.to_quantity(position, Dimension.LENGTH)
-        if angle:
-            data[f"angle_{key}"] = robot.to_quantity(angle, Dimension.ANGLE)
-            data["angle_limit"] = robot.to_quantity(limit / robot.size, Dimension.ANGLE)
-    largest = float(machine.weigh(misses[1]).max())
-    is_met = largest <= limit
-    data |= {"limit": robot.to_quantity(limit, Dimension.LENGTH), "is_met": is_met}
+    robot, others = machine.robot, tuple(set(range(misses[0].shape[1])) - {*machine.corrected})
+    is_met = machine.weigh(misses[1]) <= limit
+    sizes = [machine.measure(rows, machine.corrected) for rows in misses]
+    sizes.append((limit, limit / robot.size if sizes[0][1] else 0.0))
+    data: dict[str, Any] = {"what": size.what, "points": len(misses[1]), "is_met": is_met}
     data["nodes"] = [" x ".join(str(len(n)) for n in table.axes.values()) for table in tables]
-    data["points"] = len(misses[1])
-    data["what"] = size.what
+    for key, (position, angle) in zip(("before", "after", "limit"), sizes, strict=True):
+        data[key] = robot.to_quantity(position, Dimension.LENGTH)
+        data[f"angle_{key}"] = robot.to_quantity(angle, Dimension.ANGLE) if angle else 0
     level = Severity.INFO if is_met else Severity.WARNING
     found = [report_finding("files.table-remains", level, **data)]
-    others = [i for i in range(len(robot.controlled)) if i not in machine.corrected]
     if others:
-        left = float(machine.sizes(misses[1], others)[:, 0].max())
+        rest = robot.to_quantity(machine.measure(misses[1], others)[0], Dimension.LENGTH)
         names = tuple(robot.controlled[i] for i in others)
-        shown = robot.to_quantity(left, Dimension.LENGTH)
-        found.append(report_finding("files.table-leaves", names=names, rest=shown))
+        found.append(report_finding("files.table-leaves", names=names, rest=rest))
     return found
 
 
@@ -209,16 +200,12 @@ def _choose_grid(
         targets = place(points)
         commands = targets.copy()
         for _ in range(STEPS):
-            commands[:, columns] -= machine.miss(targets, commands)[:, columns]
+            commands[:, columns] -= machine.lead(targets, commands)[:, columns]
         lost = np.flatnonzero(~np.isfinite(commands).all(axis=1))
         if len(lost):
-            shown = ", ".join(
-                f"{name} {machine.robot.to_quantity(value, get_dimension(name))}"
-                for name, value in zip(
-                    machine.robot.controlled, targets[lost[0]].tolist(), strict=True
-                )
-            )
-            raise DataError(report_finding("files.node-out-of-reach", point=shown))
+            pairs = zip(machine.robot.controlled, targets[lost[0]].tolist(), strict=True)
+            found = [f"{n} {machine.robot.to_quantity(v, get_dimension(n))}" for n, v in pairs]
+            raise DataError(report_finding("files.node-out-of-reach", point=", ".join(found)))
         grid = (commands - targets)[:, columns].reshape(*counts, len(columns))
         correct = RegularGridInterpolator(nodes, grid)
 
@@ -226,7 +213,7 @@ def _choose_grid(
             targets = place(points)
             commands = targets.copy()
             commands[:, columns] += correct(points)  # noqa: B023  # used in this round only
-            found = machine.miss(targets, commands)
+            found = machine.lead(targets, commands)
             return found[np.isfinite(found).all(axis=1)]
 
         rest, along = [remain(checks)], []
@@ -234,10 +221,9 @@ def _choose_grid(
             middle = points[points[:, i] < own[-1]]
             middle = middle[:: max(1, len(middle) // CHECKS)]
             rest.append(remain(middle + 0.5 * (own[1] - own[0]) * np.eye(dims)[i]))
-            along.append(float(machine.weigh(rest[-1]).max()))
+            along.append(machine.weigh(rest[-1]))
         after = np.concatenate(rest)
-        largest = float(machine.weigh(after).max())
-        if largest <= limit:
+        if machine.weigh(after) <= limit:
             return nodes, grid, after
         shares = np.array(along) / limit * max(1, sum(e > 0.01 * limit for e in along))
         growth = np.clip(np.sqrt(shares), 1.0, 8.0)
@@ -256,70 +242,46 @@ def _choose_grid(
 
 
 def _fit_readings(
-    machine: _Machine, targets: FloatArray, limit: float, size: TableSize
-) -> tuple[tuple[CorrectionTable, ...], FloatArray]:
+    machine: _Machine, targets: FloatArray, limit: float, most: int
+) -> tuple[list[CorrectionTable], FloatArray]:
     """Return a table for each commanded actuator, fitted to all but `CHECKS` of the poses (n, c),
-    and what remains (n, c) at all of them.
+    and what remains at these.
     """
-    robot, controller = machine.robot, machine.controller
-    led, own = inverse(controller, targets), inverse(robot, targets)
-    usable = led.converged & own.converged
-    commanded = list_commanded(robot)
-    q, wanted = led.q[:, commanded], own.q[:, commanded]
-    is_check = usable & (np.arange(len(q)) < CHECKS)
-    is_fitted = usable & ~is_check
-    names = [a.name for a, use in zip(robot.actuators, commanded, strict=True) if use]
-    from scipy.sparse import csr_array, vstack
-    from scipy.sparse.linalg import lsmr
-
-    fits: list[list[_Fit]] = []
-    largest = limit / max(1.0, robot.size)
-    for reading, change in zip(q.T, (wanted - q).T, strict=True):
-        low, high = float(reading[usable].min()), float(reading[usable].max())
-        fits.append([])
-        count = FEWEST
-        while not fits[-1] or (
-            len(fits[-1][-1].nodes) < size.most_along and fits[-1][-1].rest > SMALL * largest
-        ):
-            nodes = np.linspace(low, high, count)
-            place = np.clip((reading[is_fitted] - low) / (nodes[1] - nodes[0]), 0.0, count - 1.0)
-            left = np.minimum(place.astype(int), count - 2)
-            hats = np.column_stack([left + 1 - place, place - left])
-            rows, columns = np.arange(len(place)), np.column_stack([left, left + 1])
-            shape = (len(place), count)
-            J = csr_array((hats.ravel(), (rows.repeat(2), columns.ravel())), shape=shape)
-            # a node that no pose is near continues its neighbors
-            bends = SMOOTHING * csr_array(np.diff(np.eye(count), 2, axis=0))
-            known = np.concatenate([change[is_fitted], np.zeros(count - 2)])
-            values = lsmr(vstack([J, bends]), known, atol=1e-12, btol=1e-12, maxiter=20 * count)[0]
-            shift = np.interp(reading, nodes, values)
-            rest = float(np.abs(shift - change)[usable].max())
-            fits[-1].append(_Fit(rest, nodes, values, shift))
-            count = min(2 * count - 1, size.most_along)
-    least = [ENOUGH * min(fit.rest for fit in own) for own in fits]
-    allowed = max(fit.rest for own in fits for fit in own)
+    led, own = (inverse(robot, targets) for robot in (machine.controller, machine.robot))
+    usable, commanded = led.converged & own.converged, list_commanded(machine.robot)
+    q, change = led.q[usable][:, commanded], (own.q - led.q)[usable][:, commanded]
+    targets, checked = targets[usable][:CHECKS], q[:CHECKS]
+    names = [a.name for a in machine.robot.actuators if a.reference is None]
+    tables = [(row[[row.argmin(), row.argmax()]], np.zeros(2)) for row in q.T]
+    tried, count = list[tuple[float, list[tuple[FloatArray, FloatArray]], FloatArray]](), FEWEST
     while True:
-        chosen = [
-            next(fit for fit in own if fit.rest <= max(allowed, enough))
-            for own, enough in zip(fits, least, strict=True)
-        ]
-        after = machine.stop(targets, q + np.column_stack([fit.shift for fit in chosen]), usable)
-        after = after[is_check]
-        if machine.weigh(after).max() <= limit or allowed <= min(least):
+        fitted = zip(q[CHECKS:].T, change[CHECKS:].T, tables, strict=True)
+        tables = [_fit_table(x, y, table, count) for x, y, table in fitted]
+        shifts = [np.interp(x, *table) for x, table in zip(checked.T, tables, strict=True)]
+        after = machine.stop(targets, checked + np.column_stack(shifts))
+        tried.append((machine.weigh(after), tables, after))
+        if tried[-1][0] <= limit or count == most:
             break
-        allowed *= 0.7
-    return tuple(
-        CorrectionTable({name: fit.nodes}, {name: fit.values})
-        for name, fit in zip(names, chosen, strict=True)
-    ), after
+        count = min(2 * count - 1, most)
+    enough = max(limit, ENOUGH * min(rest for rest, *_ in tried))
+    _, tables, after = next(trial for trial in tried if trial[0] <= enough)
+    pairs = zip(names, tables, strict=True)
+    return [CorrectionTable({name: x}, {name: y}) for name, (x, y) in pairs], after
 
 
-class _Fit(NamedTuple):
-    """A table of an actuator: what it leaves of a reading, its nodes and values, and its
-    corrections at the poses that it is fitted to and checked at.
+def _fit_table(
+    x: FloatArray, y: FloatArray, coarse: tuple[FloatArray, FloatArray], count: int
+) -> tuple[FloatArray, FloatArray]:
+    """Return nodes, and the values of the straight lines between them that fit y(x) best; where no
+    pose is near a node, a coarser table counts.
     """
+    from scipy.interpolate import make_lsq_spline
 
-    rest: float
-    nodes: FloatArray
-    values: FloatArray
-    shift: FloatArray
+    nodes = np.linspace(coarse[0][0], coarse[0][-1], count)
+    inner = (x > nodes[0]) & (x < nodes[-1])
+    places = np.concatenate([x[inner], nodes])
+    known = np.concatenate([y[inner], np.interp(nodes, *coarse)])
+    weights = np.repeat([1.0, LIGHT], [inner.sum(), count])
+    order = np.argsort(places)
+    knots = nodes[[0, *range(count), -1]]
+    return nodes, make_lsq_spline(places[order], known[order], knots, 1, weights[order])(nodes)

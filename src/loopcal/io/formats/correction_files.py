@@ -19,7 +19,6 @@ from pathlib import Path
 
 import numpy as np
 
-from loopcal.findings import report_finding
 from loopcal.io.formats.c_kinematics import note_lost_terms
 from loopcal.io.formats.program_format import (
     MM,
@@ -65,7 +64,9 @@ def write_mesh(source: ExportSource, into: Path | None) -> Exported:
     """Return a profile of Klipper, a file to include."""
     del into
     x, y, heights = _get_heights(source)
-    lines = ["# [bed_mesh] has to be in printer.cfg, and BED_MESH_PROFILE LOAD=loopcal to run."]
+    lines = [
+        f"# Load it by BED_MESH_PROFILE LOAD={PROFILE}. Set split_delta_z of [bed_mesh] to 0.01."
+    ]
     lines += [f"[bed_mesh {PROFILE}]", "version: 1", "points:"]
     lines += ["    " + ", ".join(map(format_number, row)) for row in heights.tolist()]
     for name, nodes in (("x", x), ("y", y)):
@@ -74,8 +75,7 @@ def write_mesh(source: ExportSource, into: Path | None) -> Exported:
             f"max_{name}: {format_number(nodes[-1])}",
         ]
         lines += [f"{name}_count: {len(nodes)}", f"mesh_{name}_pps: 0"]
-    text = "\n".join([*lines, "algo: direct", "tension: 0.2"]) + "\n"
-    return Exported(text, (report_finding("files.mesh-loads", profile=PROFILE),))
+    return Exported("\n".join([*lines, "algo: direct", "tension: 0.2"]) + "\n")
 
 
 def write_height_map(source: ExportSource, into: Path | None) -> Exported:
@@ -95,7 +95,7 @@ def write_height_map(source: ExportSource, into: Path | None) -> Exported:
     grid = ",".join(format_short(number, 6) for number in numbers)
     lines += [f"X,Y,{grid},{len(x)},{len(y)}"]
     lines += [",".join(f"{0.0 + h:.{decimals}f}" for h in row) for row in heights.tolist()]
-    return Exported("\n".join(lines) + "\n", (report_finding("files.height-map-loads"),))
+    return Exported("\n".join(lines) + "\n")
 
 
 def write_compensation(source: ExportSource, into: Path | None) -> Exported:
