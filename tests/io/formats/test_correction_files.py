@@ -11,6 +11,7 @@ import pytest
 import loopcal as lc
 from loopcal.apply.correction_tables import TableSize, make_tables
 from loopcal.cli.entry_point import main
+from loopcal.documents import list_controllers
 from loopcal.io.formats import FORMATS
 from loopcal.io.formats.program_format import Exported, ExportSource
 from tests.apply.test_correction_tables import disturb
@@ -130,3 +131,9 @@ def test_the_command_writes_tables_and_keeps_files(tmp_path: Path, capsys) -> No
     assert printed.out.startswith("x [mm],y [mm],z [mm],add x [mm]")
     assert main([*command, "csv", "--table-error", "2um"]) == 1
     assert main([*command, "grid-reprap", "--into", str(tmp_path / "joints.ini"), "-o", "x"]) == 1
+
+
+def test_reports_list_no_tables(machine: Pair) -> None:
+    listed = [entry.format for entry in list_controllers(ExportSource(machine[0]))]
+    assert "klipper" in listed
+    assert not any(name.startswith("grid") for name in listed)

@@ -93,6 +93,8 @@ def export_robot(source: ExportSource, target: Format, into: Path | None) -> Exp
     if target.write is None:
         known = ", ".join(list_formats("write"))
         raise DataError(f"loopcal cannot write the format {target.name}; it writes {known}")
+    if target.table is not None and not source.tables:
+        raise DataError(f"the format {target.name} is a table of corrections. Give its tables")
     if into is not None and not target.takes_file:
         raise DataError(report_finding("files.format-takes-no-file", format=target.name))
     exported = target.write(source, into)
