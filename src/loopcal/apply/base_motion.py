@@ -1,17 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Motion of the base frame when identified values replace the current ones in a controller.
+"""Motion of the base and platform frames when identified values replace those in a controller.
 
 A controller with the current values leads a program to the poses T_i of the calibrated machine, and
 with the identified values to the poses it commands, T'_i = the current model at the same readings.
-The rigid motion M that minimizes sum |M T_i - T'_i|^2 moves all of a program alike. Where nothing
-measured the base frame, M is a convention, such as which tower defines the x axis: values for which
-the model gives M T_i keep programs where they are, and all relative accuracy.
+The rigid motions M and P that minimize sum |M T_i P - T'_i|^2 move all of a program alike, and the
+tool on the platform. Where nothing measured a frame, its motion is a convention, such as which
+tower defines the x axis: values for which the model gives M T_i P keep programs where they are, and
+all relative accuracy.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -19,43 +20,55 @@ import numpy as np
 from loopcal.diagnose.gauge_freedoms import observe_motions, probe_readings
 from loopcal.errors import DataError
 from loopcal.findings import Finding, Quantity, report_finding
-from loopcal.geometry import align_point_sets, log_so3, make_pose
+from loopcal.geometry import (
+    differentiate_by_frames,
+    exp_so3,
+    log_so3,
+    make_pose,
+    solve_least_squares,
+)
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.solutions import forward
 from loopcal.typing import FloatArray
 
 VISIBLE = 5e-4  # root mean square motion, in sizes of the robot, from which it is stated
 SAME = 1e-3  # largest remaining share of a motion that other values make exactly
-STEPS = 5  # of Newton's method for these values
+STEPS = 5  # of Newton's method for motions and for these values
+ROUNDING = 1e-9  # share of the robot's size below which a frame does not move
+FRAMES = ("base", "platform")
 
 
 def choose_base(
     result: Mapping[str, Any], initial: Mechanism, robot: Mechanism, keep_frame: bool
 ) -> tuple[Mechanism, tuple[Finding, ...]]:
-    """Return the identified robot of a result (of its JSON), and whether its values move a base
-    frame that nothing measured; with `keep_frame` the robot with values that keep it.
+    """Return the identified robot of a result (of its JSON), and whether its values move frames
+    that nothing measured; with `keep_frame` the robot with values that keep them.
 
     DataError : no values do.
     """
     error = result.get("expected_error") or {}
-    if "base" not in error.get("finding", {}).get("data", {}).get("fitted", ()):
-        return robot, ()
+    fitted = error.get("finding", {}).get("data", {}).get("fitted", ())
     is_planar = result.get("height_errors") is not None  # heights determine the rest
-    finding, kept = find_base_motion(initial, robot, is_planar)
+    finding, kept = find_base_motion(initial, robot, is_planar, fitted)
     if finding is not None and keep_frame:
         if kept is None:
             raise DataError(finding)
-        robot, finding = kept, find_base_motion(initial, kept, is_planar)[0]
+        robot, finding = kept, find_base_motion(initial, kept, is_planar, fitted)[0]
     return robot, () if finding is None else (finding,)
 
 
 def find_base_motion(
-    initial: Mechanism, robot: Mechanism, is_planar: bool
+    initial: Mechanism, robot: Mechanism, is_planar: bool, frames: Sequence[str] = FRAMES
 ) -> tuple[Finding | None, Mechanism | None]:
-    """Return the motion from an initial robot to the identified one, None where it is not visible,
-    and the identified robot with values that do without it, or without its rotation alone; None
-    where no values do. `is_planar` : only x, y and the angle about z count.
+    """Return the motion of frames from an initial robot to the identified one, None where it is not
+    visible, and the identified robot with values that do without it, or without its rotation alone;
+    None where no values do. `is_planar` : only x, y and the angle about z of the base count.
     """
+    allowed = np.repeat([frame in frames for frame in FRAMES], 6)
+    if is_planar:
+        allowed[[0, 1, *range(5, 12)]] = False
+    if not allowed.any():
+        return None, None
     readings = probe_readings(robot)
     new, old = forward(robot, readings), forward(initial, readings)
     usable = new.converged & old.converged
@@ -70,35 +83,50 @@ def find_base_motion(
         """Return the points (n r, 3) of poses."""
         return (arms @ T[:, :3, :3].transpose(0, 2, 1) + T[:, None, :3, 3]).reshape(-1, 3)
 
-    points, reference = place(new.T[usable]), place(old.T[usable])
+    def list_rows(T: FloatArray, twists: FloatArray) -> FloatArray:
+        """Return the motions (n r 3, k) of the points by twists (n, 6, k) of poses."""
+        arm = (arms @ T[:, :3, :3].transpose(0, 2, 1))[..., None]
+        rows = twists[:, None, 3:] + np.cross(twists[:, None, :3], arm, axis=2)
+        return rows.reshape(-1, twists.shape[-1])
+
+    T = new.T[usable]
+    points, reference = place(T), place(old.T[usable])
     level = np.array([1.0, 1.0, 0.0 if is_planar else 1.0])
-    M = align_point_sets(points * level, reference * level)
-    turn, shift = M[:3, :3], M[:3, 3]
-    moved = points @ turn.T + shift - points
+    M, P = np.eye(4), np.eye(4)
+    for _ in range(STEPS):
+        J = list_rows(M @ T @ P, differentiate_by_frames(M @ T @ P)[..., allowed])
+        step = np.zeros(12)
+        left = (reference - place(M @ T @ P)) * level
+        step[allowed] = _solve(J * np.tile(level, len(points))[:, None], left.ravel())
+        M = make_pose(exp_so3(step[:3]), step[3:6]) @ M
+        P = P @ make_pose(exp_so3(step[6:9]), step[9:])
+    moved = place(M @ T @ P) - points
     if np.sqrt((moved**2).sum(axis=1).mean()) < VISIBLE * robot.size:
         return None, None
     keeps, kept = "", None
-    for word, motion in (("both", M), ("turn", make_pose(turn, np.zeros(3)))):
-        wanted, trial = points @ motion[:3, :3].T + motion[:3, 3], robot
+    for word, share in (("both", 1.0), ("turn", 0.0)):
+        before, after = (make_pose(F[:3, :3], share * F[:3, 3]) for F in (M, P))
+        wanted, trial = place(before @ T @ after), robot
         for _ in range(STEPS):
-            T, twist = observe_motions(trial, readings)
-            if len(T) < len(readings):
+            reached, twist = observe_motions(trial, readings)
+            if len(reached) < len(readings):
                 break
-            arm, by_parameter = arms @ T[:, :3, :3].transpose(0, 2, 1), np.moveaxis(twist, -1, 0)
-            by_parameter = by_parameter[:, :, None]  # (p, n, 1, 6)
-            rows = by_parameter[..., 3:] + np.cross(by_parameter[..., :3], arm)
-            J, left = rows.reshape(len(rows), -1).T, (wanted - place(T)).ravel()
-            scale = 1.0 / np.maximum(np.linalg.norm(J, axis=0), 1e-12)
-            step = scale * np.linalg.lstsq(J * scale, left, rcond=1e-9)[0]
+            step = _solve(list_rows(reached, twist), (wanted - place(reached)).ravel())
             trial = trial.with_values(trial.values + step)
         rest = np.linalg.norm(wanted - place(forward(trial, readings).T))
         if rest < SAME * np.linalg.norm(wanted - points):
             keeps, kept = word, trial
             break
-    angle, length = (float(np.linalg.norm(v)) for v in (log_so3(turn), shift))
-    sizes = {
-        "turn": Quantity(math.degrees(angle), "deg"),
-        "shift": Quantity(1e3 * length, "mm"),
-        "keeps": keeps,
-    }
+    sizes: dict[str, Any] = {"keeps": keeps, "frames": tuple(f for f in FRAMES if f in frames)}
+    for frame, F in zip(FRAMES, (M, P), strict=True):
+        angle, length = (float(np.linalg.norm(v)) for v in (log_so3(F[:3, :3]), F[:3, 3]))
+        is_moved = angle * robot.size + length > ROUNDING * robot.size
+        sizes[f"{frame}_turn"] = Quantity(math.degrees(angle), "deg") if is_moved else 0
+        sizes[f"{frame}_shift"] = Quantity(1e3 * length, "mm") if is_moved else 0
     return report_finding("files.base-moves", **sizes), kept
+
+
+def _solve(J: FloatArray, left: FloatArray) -> FloatArray:
+    """Return the shortest step (k,), in units of its effects, that removes what is left (m,)."""
+    scale = 1.0 / np.maximum(np.linalg.norm(J, axis=0), 1e-12)
+    return scale * solve_least_squares(J * scale, left)
