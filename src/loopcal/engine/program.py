@@ -255,6 +255,13 @@ class Program:
         """Whether closure with locked actuators has as many equations as the nodes freedoms."""
         return self.count_equations(free=False) == len(self.unknown_twists)
 
+    @cached_property
+    def drive_map(self) -> ParameterMap:
+        """The map of no parameters, and of readings that are the values of driven joints."""
+        pattern = MapPattern(0, np.zeros((0, 2), np.int64), np.zeros((0, 3), np.int64))
+        none, a = np.zeros((1, 0)), self.n_joints
+        return ParameterMap(pattern, none, none, np.zeros((1, 1, a, 0)), np.ones((1, 1, a)))
+
     def count_equations(self, *, free: bool) -> int:
         """Return the number of closure equations without passive joints, and with `free` drives."""
         return sum(len(g.limbs) * (len(g.rows) - len(g.unknown_joints(free))) for g in self.groups)

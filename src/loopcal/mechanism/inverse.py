@@ -10,9 +10,8 @@ docs/theory/kinematics.md.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,10 +24,12 @@ from loopcal.mechanism.chains import (
     has_spare_drives,
     join_stage_states,
     list_carrying_stages,
+    locate_stage_bases,
     split_stage_states,
+    transport_twists,
 )
 from loopcal.mechanism.kinematics import close_at_joints, compute_closure_sign, solve_serial
-from loopcal.mechanism.limb_rows import measure_rod, place_links, sum_displacements
+from loopcal.mechanism.limb_rows import measure_rod, move_serial, place_serial, sum_displacements
 from loopcal.mechanism.model import Mechanism, Stage
 from loopcal.mechanism.platform_coordinates import (
     POSITION,
@@ -47,8 +48,8 @@ from loopcal.mechanism.transmission import (
     select_weights,
     transmit_readings,
 )
-from loopcal.numerics.gauss_newton import Halving, minimize_by_halving
-from loopcal.numerics.trial_batch import map_arrays
+from loopcal.numerics.gauss_newton import ROUNDING as ROUNDED
+from loopcal.numerics.trial_batch import TrialBatch, map_arrays
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
 ITERATIONS = 60
@@ -97,11 +98,17 @@ def _close_with_free_actuators(
     start: State | None,
     max_iterations: int = ITERATIONS,
 ) -> State:
-    """Return states (t, n) at controlled coordinates, all actuated joints free, from `start`."""
+    """Return states (t, n) at controlled coordinates, all actuated joints free, from `start`; with
+    shared drives, other coordinates are those of the start.
+    """
     e, _ = robot.slots(values)
-    names, size = robot.controlled, robot.size
-    T, guess = pose_from_coordinates(target, names, robot.home), driven_values(robot.program, begin)
-    if determine_platform(robot):
+    names, size, is_shared = robot.controlled, robot.size, robot.program.shared_drive_count > 0
+    T = pose_from_coordinates(target, names, begin.T if is_shared else robot.home)
+    guess = driven_values(robot.program, begin)
+    if is_shared:
+        names, start = tuple(ANGLES.get(f, f) for f in robot.freedoms), replace(begin, T=T)
+        target = read_coordinates(T, names)
+    elif determine_platform(robot):
         limbs = robot.program.with_fixed_platform
         start = replace(begin, T=T)
         return engine.solve(limbs, e, guess, start, free=True, max_iterations=max_iterations)
@@ -234,19 +241,22 @@ fewer on a path, whose targets are near.
 
 In ten steps the longest ones turn a joint by 5 rad. Steps close to a stretched arm gain less.
 """
-NEXT, LAST = (1, 2, 0), (2, 0, 1)
-"""Components of a cross product: a x b = a[NEXT] b[LAST] - a[LAST] b[NEXT]."""
+SHORT_SHARE = 1e-9
+"""Share of its distance from the target that a projected row must be able to lose, to first order,
+beside `CLOSE`, to go on."""
+DEPENDENT = 1e-9
+"""Relative singular value below which a combination of drives does not move the platform."""
 PATH_STEPS = 8
 """Steps of the path from the start's pose to a target."""
 
 
 @dataclass(frozen=True, eq=False)
-class _Iterate:
+class _Iterate(TrialBatch):
     """R rows: their driven joints u, the states (R, 1) of the stages with loops, and the rest.
 
     u : (R, u) values of joints, of a stage with open sums these sums [m, rad].
     T : (R, 4, 4) end platform [m]. D : (R, 6, u) its twists by the drives, NaN with open loops.
-    gap : (R,) distance from the target [m].
+    gap : (R,) distance from the target [m]. left : (R,) the part of it that the iteration removes.
     step : (R, u) Newton step. sign : (R,) of det(C D), 1 with more drives than coordinates.
     status, count : (R,) of the iteration.
     """
@@ -256,82 +266,11 @@ class _Iterate:
     T: FloatArray
     D: FloatArray
     gap: FloatArray
+    left: FloatArray
     step: FloatArray
     sign: FloatArray
     status: NDArray[np.int8]
     count: IntArray
-
-    def take(self, rows: IntArray) -> _Iterate:
-        """Return some rows by their positions."""
-        is_whole = np.array_equal(rows, np.arange(len(self.u)))
-        return self if is_whole else map_arrays(lambda a: a[rows], self)
-
-    def put(self, rows: IntArray, new: _Iterate) -> _Iterate:
-        """Return the same rows with some replaced, by their positions in ascending order."""
-        if len(rows) == len(self.u):
-            return new
-
-        def replaced(old: np.ndarray, part: np.ndarray) -> np.ndarray:
-            out = np.array(old)
-            out[rows] = part
-            return out
-
-        return map_arrays(replaced, self, new)
-
-
-class _SerialJoints(NamedTuple):
-    """The joints of the serial stages of a chain, between displaced links.
-
-    places : the joints of each stage. column : (E,) the place of each among the drives.
-    turn, advance : (1 | R, E) radians and metres of motion per unit of the joint; that of a stage
-        without joints does not move.
-    before, after : (1 | R, E, 4, 4) links on both sides; after the last joint of a stage only.
-    """
-
-    places: tuple[range, ...]
-    column: IntArray
-    turn: FloatArray
-    advance: FloatArray
-    before: FloatArray
-    after: FloatArray
-
-    def move(self, u: FloatArray) -> FloatArray:
-        """Return the motions (R, E, 4, 4) from before the links to behind them."""
-        value = u[:, self.column]
-        angle = self.turn * value
-        M = np.zeros((*value.shape, 4, 4))
-        M[..., 0, 0] = M[..., 1, 1] = np.cos(angle)
-        M[..., 1, 0] = np.sin(angle)
-        M[..., 0, 1] = -M[..., 1, 0]
-        M[..., 2, 2] = M[..., 3, 3] = 1.0
-        M[..., 2, 3] = self.advance * value
-        return self.before @ M @ self.after
-
-
-def _place_serial_joints(stages: Sequence[Stage], e: Sequence[FloatArray]) -> _SerialJoints:
-    """Return the joints of the serial stages for the displacements (t, d) of each stage."""
-    serial = [stage for stage in stages if stage.robot.is_serial]
-    counts = [max(len(stage.robot.program.groups[0].joints), 1) for stage in serial]
-    shape = len(e[0]), sum(counts)
-    before, after = np.zeros((2, *shape, 4, 4)) + np.eye(4)
-    turn, advance = np.zeros((2, *shape))
-    column, places = np.zeros(shape[1], int), list[range]()
-    last = 0
-    for own, displacements in zip(stages, e, strict=True):
-        first = last
-        if own.robot.is_serial:
-            (group,) = own.robot.program.groups
-            J = len(group.joints)
-            last = first + max(J, 1)
-            links, pitch = place_links(group, 0, displacements)
-            place = slice(first, first + J)
-            before[:, place] = links[:, :J]
-            after[:, last - 1] = links[:, J] @ geometry.invert_pose(links[:, -1])
-            turn[:, place] = [letter == "R" for letter in group.joints]
-            advance[:, place] = np.where(turn[:, place] > 0.0, pitch, 1.0)
-            column[place] = own.actuators.start + group.actuator[:J, 0]
-        places.append(range(first, last))
-    return _SerialJoints(tuple(places), column, turn, advance, before, after)
 
 
 @dataclass(frozen=True, eq=False)
@@ -340,149 +279,115 @@ class _Rows:
 
     A robot of one stage is a chain of itself.
 
-    values : (1 | R, p). target : (R, c) controlled coordinates. e, sums, terms : displacements,
-        open sums, and transmissions of each stage, (1 | R, ..).
+    values : (1 | R, p). target : (R, c) controlled coordinates. e, links, sums, terms : of each
+        stage displacements, links and pitches of `place_serial` without loops, open sums, and
+        transmissions, (1 | R, ..).
     sign : (R,) of det(C D) at the start. moving : drives that carry the end platform.
     units : (u,) lengths that a unit of each drive counts for: the robot's size for an angle.
     spans : (u,) strokes of the drives, of which steps take equal shares with more drives than
         coordinates; a full turn or the size without a stroke, and where the step is unique.
+    poses : (R, 4, 4) in place of coordinates, of which the nearest ones are searched for.
     """
 
+    shared: ClassVar[tuple[str, ...]] = ("robot", "units", "spans", "moving")
+
     robot: Mechanism
-    stages: tuple[Stage, ...]
     values: FloatArray
     target: FloatArray
     e: tuple[FloatArray, ...]
+    links: tuple[tuple[FloatArray, FloatArray] | None, ...]
     sums: tuple[OpenSums | None, ...]
     terms: tuple[FloatArray, ...]
     sign: FloatArray
-    serial: _SerialJoints
     units: FloatArray
     spans: FloatArray
     moving: IntArray
+    poses: FloatArray | None = None
 
     def select(self, rows: IntArray) -> _Rows:
         """Return some rows by their positions."""
         if np.array_equal(rows, np.arange(len(self.target))):
             return self
-
-        def chosen(a: np.ndarray) -> np.ndarray:
-            return a if len(a) == 1 else a[rows]
-
-        chosen_arrays = {
-            name: map_arrays(chosen, getattr(self, name))
-            for name in ("values", "e", "sums", "terms")
-        }
-        serial = self.serial._replace(
-            **{name: chosen(getattr(self.serial, name)) for name in self.serial._fields[2:]}
-        )
-        own = self.target[rows], self.sign[rows]
-        return replace(self, target=own[0], sign=own[1], serial=serial, **chosen_arrays)
+        return map_arrays(lambda a: a if len(a) == 1 else a[rows], self)
 
     def evaluate(self, u: FloatArray, begin: tuple[State, ...]) -> _Iterate:
         """Return the iterate at driven joints u (R, u); its gap is infinite for an open loop."""
-        return self.aim(self.place(u, begin))
-
-    def place(self, u: FloatArray, begin: tuple[State, ...]) -> _Iterate:
-        """Return the iterate at driven joints u (R, u) without its step; D is NaN of open loops."""
-        R = len(u)
-        loops, ok = [], np.isfinite(u).all(axis=1)
-        for i, start in zip(self._list_loops(), begin, strict=True):
-            stage = self.stages[i]
-            own = u[:, None, stage.actuators][..., : stage.robot.program.n_joints]
-            weights, sums = None, self.sums[i]
-            if sums is not None:
-                weights, own = sums.weights, sums.complete(own)
-            part = close_at_joints(stage.robot, self.e[i], own, start, False, weights=weights)
-            ok &= part.status[:, 0] == CONVERGED
-            loops.append(part)
+        stages, states, moved = self.robot.blocks, list[State](), list[tuple[FloatArray, ...]]()
+        ok, loops = np.isfinite(u).all(axis=1), iter(begin)
         with np.errstate(invalid="ignore"):
-            T, D = self._move(u, loops)
+            for stage, e, links, sums in zip(stages, self.e, self.links, self.sums, strict=True):
+                robot, own, weights = stage.robot, _select_drives(stage, u), None
+                if links is not None:
+                    moved.append(move_serial(robot.program.groups[0], *links, own[:, 0]))
+                    continue
+                if sums is not None:
+                    weights, own = sums.weights, sums.complete(own)
+                state = close_at_joints(robot, e, own, next(loops), False, weights=weights)
+                by_drive = differentiate_by_drives(robot, e, own, state, weights)[:, 0]
+                moved.append((state.T[:, 0], by_drive[..., : sums and sums.chosen]))
+                states.append(state)
+                ok &= state.status[:, 0] == CONVERGED
+            bases, platforms = locate_stage_bases(stages, [T for T, _ in moved])
+            D = np.zeros((len(u), 6, u.shape[1]))
+            for i, transport in transport_twists(self.robot, bases, platforms, -1):
+                first, by_drive = stages[i].actuators.start, moved[i][1]
+                D[..., first : first + by_drive.shape[2]] = transport @ by_drive
         D[~ok] = np.nan
-        none = np.zeros(R)
-        status = none.astype(np.int8)
-        return _Iterate(
-            u, tuple(loops), T, D, none, np.zeros_like(u), none, status, none.astype(int)
-        )
+        none = np.zeros(len(u))
+        status, zero = none.astype(np.int8), np.zeros_like(u)
+        T = np.broadcast_to(platforms[-1], (len(u), 4, 4))
+        parts = tuple(states), T, D, none, none, zero, none, status, none.astype(int)
+        return self.aim(_Iterate(u, *parts))
+
+    def compare(self, T: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return how far poses (R, 4, 4) are from the targets (R, c) [m], and the columns (R, c, 6)
+        per twist.
+        """
+        robot = self.robot
+        if self.poses is None:
+            return compare_coordinates(T, self.target, robot.controlled, robot.size)
+        gap = geometry.pose_difference(T, self.poses) * robot.twist_scale
+        return gap, np.broadcast_to(np.diag(robot.twist_scale), (len(T), 6, 6))
 
     def aim(self, now: _Iterate) -> _Iterate:
         """Return an iterate with the distance from the target and the step towards it."""
         with np.errstate(invalid="ignore"):
-            residual, columns = compare_coordinates(
-                now.T, self.target, self.robot.controlled, self.robot.size
-            )
+            residual, columns = self.compare(now.T)
             slope = np.matmul(columns, now.D)[..., self.moving] * self.spans[self.moving]
         ok = np.isfinite(slope).all(axis=(1, 2)) & np.isfinite(residual).all(axis=1)
         if not ok.all():
             slope[~ok], residual[~ok] = np.eye(*slope.shape[1:]), 0.0
-        is_square = slope.shape[1] == slope.shape[2]
+        is_square = slope.shape[1] == slope.shape[2] and self.poses is None
         sign = np.sign(np.linalg.det(slope)) if is_square else np.ones(len(ok))
-        inverse = np.linalg.inv(slope) if is_square and sign.all() else np.linalg.pinv(slope)
+        is_regular = is_square and sign.all()
+        inverse = np.linalg.inv(slope) if is_regular else np.linalg.pinv(slope, rcond=DEPENDENT)
+        moved = -np.matmul(inverse, residual[..., None])
         step = np.zeros_like(now.u)
-        step[:, self.moving] = -np.matmul(inverse, residual[..., None])[..., 0]
+        step[:, self.moving] = moved[..., 0]
         step *= self.spans
         # no joint moves farther than the longest step: in radians, or sizes of the robot
         length = np.abs(step * self.units).max(axis=1, initial=0.0) / self.robot.size
         longest = np.maximum(length, LONGEST_STEP)
+        gap = left = np.where(ok, np.linalg.norm(residual, axis=1), np.inf)
+        if self.poses is not None:
+            left = np.where(ok, np.linalg.norm(np.matmul(slope, moved)[..., 0], axis=1), np.inf)
         return replace(
             now,
-            gap=np.where(ok, np.linalg.norm(residual, axis=1), np.inf),
+            gap=gap,
+            left=left,
             step=step * (LONGEST_STEP / longest)[:, None],
             sign=np.where(ok, sign, 0.0),
         )
-
-    def _list_loops(self) -> list[int]:
-        """Return the stages with loops."""
-        return [i for i, stage in enumerate(self.stages) if not stage.robot.is_serial]
-
-    def _move(self, u: FloatArray, loops: Sequence[State]) -> tuple[FloatArray, FloatArray]:
-        """Return the end platform (R, 4, 4) and its twists by the drives (R, 6, u)."""
-        X = self.serial.move(u)
-        ends: list[FloatArray] = []
-        F = np.empty((len(u), 4, 4, len(self.serial.column)))  # frames whose z axes are the joints
-        D = np.zeros((len(u), 6, u.shape[1]))
-        pieces, parts = [], iter(loops)
-        for i, stage in enumerate(self.stages):
-            T = stage.mount if stage.parent < 0 else ends[stage.parent] @ stage.mount
-            if stage.robot.is_serial:
-                for k in self.serial.places[i]:
-                    F[..., k] = T @ self.serial.before[:, k]
-                    T = T @ X[:, k]
-            else:
-                part = next(parts)
-                base, T = T, T @ part.T[:, 0]
-                pieces.append((i, base, T, part))
-            ends.append(T)
-        T = np.broadcast_to(ends[-1], (len(u), 4, 4))
-        for i, base, at, part in pieces:
-            stage, sums = self.stages[i], self.sums[i]
-            robot, e = stage.robot, self.e[i]
-            own = u[:, None, stage.actuators][..., : robot.program.n_joints]
-            place = slice(stage.actuators.start, stage.actuators.start + own.shape[2])
-            if sums is None:
-                by_drive = differentiate_by_drives(robot, e, own, part, None)[:, 0]
-            else:
-                by_drive = np.zeros((len(u), 6, own.shape[2]))
-                by_sum = differentiate_by_drives(robot, e, sums.complete(own), part, sums.weights)
-                by_drive[..., : sums.chosen] = by_sum[:, 0, :, : sums.chosen]
-            arm = np.matmul(np.swapaxes(base[..., :3, :3], -1, -2), (T - at)[:, :3, 3:])[..., 0]
-            D[..., place] = geometry.transport_matrix(arm, base[..., :3, :3]) @ by_drive
-        axis, arm = F[:, :3, 2], T[:, :3, 3, None] - F[:, :3, 3]
-        turn, across = self.serial.turn[:, None] * axis, axis[:, NEXT] * arm[:, LAST]
-        moved = self.serial.turn[:, None] * (across - axis[:, LAST] * arm[:, NEXT])
-        moved += self.serial.advance[:, None] * axis
-        D[..., self.serial.column] += np.concatenate([turn, moved], axis=1)
-        return T, D
 
     def is_in_other_mode(self, now: _Iterate) -> BoolArray:
         """Return the rows (R,) beyond a singularity, of which an open start knows none, or beyond
         the dead center of a triangle drive.
         """
         beyond = (now.sign != self.sign) & (self.sign != 0.0)
-        for stage, tau in zip(self.stages, self.terms, strict=True):
+        for stage, tau in zip(self.robot.blocks, self.terms, strict=True):
             triangles = find_triangles(tau)
             if len(triangles):
-                u = now.u[:, None, stage.actuators][..., : stage.robot.program.n_joints]
+                u = _select_drives(stage, now.u)
                 weights = select_weights(tau, stage.robot.slots.constants)
                 if weights is not None and weights.shape[2] == u.shape[2]:
                     u = apply_weights(weights, u)
@@ -499,14 +404,14 @@ class _Rows:
         period = PROGRESS_ON_PATH if on_path else PROGRESS_STEPS
         done = now = start
         rows, alive, share = self, np.arange(R), np.ones(R)
-        before = now.gap
+        before = now.left
         for count in range(STEPS + 1):
-            arrived = now.gap <= close
             broken = ~np.isfinite(now.gap)
+            arrived = ~broken & (now.left <= close + SHORT_SHARE * now.gap)
             end = arrived | broken | (share < SHORTEST_SHARE)
             if count % period == 0 and count:
-                end |= now.gap > PROGRESS * before
-                before = now.gap
+                end |= now.left > PROGRESS * before
+                before = now.left
             if end.any() or count == STEPS:
                 status = np.where(end, np.int8(STALLED), np.int8(EXHAUSTED))
                 status[broken], status[arrived] = NOT_FINITE, CONVERGED
@@ -518,7 +423,8 @@ class _Rows:
                 rows, now = rows.select(keep), now.take(keep)
                 alive, share, before = alive[keep], share[keep], before[keep]
             trial = rows.evaluate(now.u + share[:, None] * now.step, now.loops)
-            better = trial.gap <= np.maximum((1 - 1e-4 * share) * now.gap, close)
+            square = (1.0 + ROUNDED) * now.gap**2 - 2e-4 * share * now.left**2
+            better = trial.gap <= np.maximum(np.sqrt(square.clip(min=0.0)), close)
             share = np.where(better, np.minimum(1.0, 4 * share), 0.25 * share)
             if better.all():
                 now = trial
@@ -528,15 +434,21 @@ class _Rows:
         is_other = (done.status == CONVERGED) & self.is_in_other_mode(done)
         return replace(done, status=np.where(is_other, np.int8(Status.OTHER_MODE), done.status))
 
-    def list_states(self, now: _Iterate) -> list[State]:
-        """Return the states (R, 1) of all stages at an iterate."""
-        parts = iter(now.loops)
-        return [
-            solve_serial(stage.robot, e, now.u[:, None, stage.actuators])
+    def join_states(self, now: _Iterate) -> State:
+        """Return the state (R, 1) at an iterate."""
+        loops = iter(now.loops)
+        states = [
+            solve_serial(stage.robot, e, _select_drives(stage, now.u))
             if stage.robot.is_serial
-            else next(parts)
-            for stage, e in zip(self.stages, self.e, strict=True)
+            else next(loops)
+            for stage, e in zip(self.robot.blocks, self.e, strict=True)
         ]
+        return join_stage_states(self.robot, states)
+
+
+def _select_drives(stage: Stage, u: FloatArray) -> FloatArray:
+    """Return the driven joints (R, 1, a) of a stage."""
+    return u[:, None, stage.actuators][..., : stage.robot.program.n_joints]
 
 
 def _solve_by_drives(
@@ -565,7 +477,7 @@ def _solve_by_drives(
     rows = replace(rows, sign=start.sign)
     last = _solve_within_reach(rows, start, first, follow)
     status = np.where(np.isfinite(wanted).all(axis=1), last.status, np.int8(NOT_FINITE))
-    state = join_stage_states(robot, rows.list_states(last))
+    state = rows.join_states(last)
     left = np.linalg.norm(
         compare_coordinates(last.T, wanted, robot.controlled, robot.size)[0], axis=1
     )
@@ -582,7 +494,6 @@ def _make_rows(robot: Mechanism, values: FloatArray, target: FloatArray) -> _Row
     """Return rows with values (1 | R, p) and targets (R, c)."""
     stages = robot.blocks
     slots = [stage.robot.slots(values[:, stage.parameters]) for stage in stages]
-    e = tuple(own for own, _ in slots)
     sums = tuple(
         list_open_sums(stage.robot, values[:, stage.parameters])
         if stage.robot.has_open_sums or stage.robot.assembly.couplings
@@ -601,14 +512,16 @@ def _make_rows(robot: Mechanism, values: FloatArray, target: FloatArray) -> _Row
         turns += [not turning.isdisjoint(names) for names in drives]
     return _Rows(
         robot,
-        stages,
         values,
         target,
-        e,
+        tuple(e for e, _ in slots),
+        tuple(
+            place_serial(stage.robot.program.groups[0], e) if stage.robot.is_serial else None
+            for stage, (e, _) in zip(stages, slots, strict=True)
+        ),
         sums,
         tuple(tau for _, tau in slots),
         np.zeros(len(target)),
-        _place_serial_joints(stages, e),
         np.where(turns, robot.size, 1.0),
         measure_spans(robot, np.array(turns)),
         find_carrying_actuators(robot),
@@ -635,16 +548,16 @@ def measure_spans(robot: Mechanism, turns: BoolArray) -> FloatArray:
 
 def _begin(rows: _Rows, first: State) -> _Iterate:
     """Return the iterates of a state (R, 1)."""
-    u, loops, robot = [], [], rows.robot
-    states = split_stage_states(robot, first)
-    for stage, own, sums in zip(rows.stages, states, rows.sums, strict=True):
+    u, loops = np.zeros((len(first.T), len(rows.robot.actuators))), list[State]()
+    states = split_stage_states(rows.robot, first)
+    for stage, own, sums in zip(rows.robot.blocks, states, rows.sums, strict=True):
         joints = driven_values(stage.robot.program, own)
         joints = joints if sums is None else sums.read(joints)
-        spare = len(stage.robot.actuators) - joints.shape[2]  # a condition moves no joint
-        u.append(np.pad(joints, [(0, 0), (0, 0), (0, spare)]))
+        begin = stage.actuators.start  # a condition behind the joints moves none
+        u[:, begin : begin + joints.shape[2]] = joints[:, 0]
         if not stage.robot.is_serial:
             loops.append(own)
-    return rows.evaluate(np.concatenate(u, axis=2)[:, 0], tuple(loops))
+    return rows.evaluate(u, tuple(loops))
 
 
 def _solve_within_reach(rows: _Rows, start: _Iterate, first: State, follow: bool) -> _Iterate:
@@ -668,7 +581,8 @@ def _solve_within_reach(rows: _Rows, start: _Iterate, first: State, follow: bool
 
 def _begin_near_targets(rows: _Rows, start: _Iterate, first: State) -> _Iterate:
     """Return the iterates at which rows begin: the proposed ones, or the first."""
-    near = _propose_state(rows.robot, rows.values, rows.target, first)
+    target = rows.target.reshape(*first.T.shape[:2], -1)
+    near = _close_with_free_actuators(rows.robot, rows.values, target, first, first)
     good = np.flatnonzero(near.status[:, 0] == CONVERGED)
     if not len(good):
         return start
@@ -695,120 +609,13 @@ def _follow_path(rows: _Rows, start: _Iterate) -> _Iterate:
     return now
 
 
-def _propose_state(robot: Mechanism, values: FloatArray, target: FloatArray, start: State) -> State:
-    """Return states with every joint free at targets (R, c), (1, R) or (R, 1); with shared drives,
-    other coordinates are those of the start.
-    """
-    if robot.assembly.couplings or not robot.program.shared_drive_count:
-        shaped = target.reshape(*start.T.shape[:2], -1)
-        return _close_with_free_actuators(robot, values, shaped, start, start)
-    e, _ = robot.slots(values)
-    names = tuple(ANGLES.get(freedom, freedom) for freedom in robot.freedoms)
-    T = pose_from_coordinates(target, robot.controlled, start.T.reshape(-1, 4, 4))
-    whole = read_coordinates(T, names)
+# The reachable pose nearest to one that takes more freedoms than the robot has.
 
-    def command(current: FloatArray, rows: np.ndarray) -> tuple[FloatArray, FloatArray]:
-        return compare_coordinates(current, whole[rows], names, robot.size)
-
-    begin = replace(start, T=T.reshape(start.T.shape))
-    return engine.solve(
-        robot.program, e, driven_values(robot.program, begin), begin, command, free=True
-    )
-
-
-# The reachable pose nearest to one that takes more freedoms than the robot has: Gauss-Newton steps
-# of the drives.
-
-PROJECTION_STEPS, SHARES = 20, 0.5 ** np.arange(5)
-"""Steps of a projection, and shares that are tried of each: a row ends where none of them lowers
-its distance, as at the end of the reach."""
-SHORT_STEP, SHORT_SHARE = 1e-12, 1e-9
-"""The last step changes the distance from the target to first order by this length, relative to the
-robot's size, and this share."""
 STATIONARY = 1e-6
 """A pose is the nearest one where a step changes the distance by at most this share to first order,
 or by this share of `REACHED`, where the target itself is reachable."""
 REACHED = 1e-3
 """Distance below which a target counts as reachable, relative to the robot's size."""
-DEPENDENT = 1e-9
-"""Relative singular value below which a combination of drives does not move the platform."""
-
-
-class _Point(NamedTuple):
-    """Iterates of R rows, their differences (R, 6) from the targets in lengths [m], and the sums of
-    their squares (R,) [m^2], infinite where the loops are open. bent : (R,) whose last step was too
-    long.
-    """
-
-    now: _Iterate
-    gap: FloatArray
-    cost: FloatArray
-    bent: BoolArray
-
-
-class _Step(NamedTuple):
-    """Changes of the drives (R, u), the squared change (R,) of the differences to first order
-    [m^2], and the share (R, 1) that is no longer than the longest step.
-    """
-
-    drives: FloatArray
-    change: FloatArray
-    share: FloatArray
-
-
-class _Projection(NamedTuple):
-    """The projection of R rows onto what is reachable, to poses T (R, 4, 4)."""
-
-    rows: _Rows
-    T: FloatArray
-    control: Halving
-
-    def measure(self, now: _Iterate, bent: BoolArray, of: IntArray | slice = slice(None)) -> _Point:
-        """Return iterates of these rows with their differences from the targets."""
-        gap = geometry.pose_difference(now.T, self.T[of]) * self.rows.robot.twist_scale
-        cost = np.where(np.isfinite(now.D).all(axis=(1, 2)), (gap**2).sum(axis=1), np.inf)
-        return _Point(now, gap, cost, bent)
-
-    def propose(self, point: _Point) -> _Step:
-        """Return the Gauss-Newton step of the drives that carry the platform."""
-        rows, robot = self.rows, self.rows.robot
-        slope = point.now.D * robot.twist_scale[:, None] * rows.spans
-        slope = np.where(np.isfinite(point.cost)[:, None, None], slope, 0.0)[..., rows.moving]
-        inverse = np.linalg.pinv(slope, rcond=DEPENDENT)
-        step = np.matmul(inverse, -point.gap[..., None])
-        change, drives = np.matmul(slope, step)[..., 0], np.zeros_like(point.now.u)
-        drives[:, rows.moving] = step[..., 0]
-        drives *= rows.spans
-        length = np.abs(drives * rows.units).max(axis=1, keepdims=True) / robot.size
-        return _Step(drives, (change**2).sum(axis=1), LONGEST_STEP / length.clip(LONGEST_STEP))
-
-    def move(self, point: _Point, step: _Step, share: FloatArray) -> _Point:
-        """Return the points at the longest of the `SHARES` of these shares (R, 1) of a step that
-        does not raise the distance; where none does, a row stays.
-
-        A row whose last step was too long tries all of them at once, any other the first one alone
-        before.
-        """
-        now, left = point.now, np.flatnonzero(share[:, 0])
-        gap, cost, bent = point.gap.copy(), point.cost.copy(), point.bent.copy()
-        first, last = np.zeros(len(bent), int), np.where(bent, len(SHARES), 1)
-        while len(left):
-            row = np.repeat(left, (last - first)[left])
-            tried = np.concatenate([np.arange(first[i], last[i]) for i in left])
-            begin = point.now.take(row)
-            u = begin.u + SHARES[tried, None] * share[row] * step.drives[row]
-            trial = self.measure(self.rows.select(row).place(u, begin.loops), bent, row)
-            lower = np.flatnonzero(~self.control.is_worse(trial.cost, point.cost[row]))
-            best = np.full(len(bent), -1)
-            best[row[lower[::-1]]] = lower[::-1]  # of each row the first one
-            chosen = left[best[left] >= 0]
-            own = best[chosen]
-            now = now.put(chosen, trial.now.take(own))
-            gap[chosen], cost[chosen] = trial.gap[own], trial.cost[own]
-            bent[left], bent[chosen] = True, tried[own] > 0
-            left = left[(best[left] < 0) & (last[left] < len(SHARES))]
-            first, last = np.ones_like(first), np.full_like(last, len(SHARES))
-        return _Point(now, gap, cost, bent)
 
 
 def find_nearest_reachable(
@@ -825,18 +632,14 @@ def find_nearest_reachable(
     first = map_arrays(lambda a: a[0, closed, None], state)
     if not moves_by_drives(robot):
         first = replace(first, closure_sign=compute_closure_sign(robot, values, first))
-    rows = _make_rows(robot, values, wanted[0, closed])
-    # each step is halved by `move`
-    control = Halving(PROJECTION_STEPS, 1, SHORT_SHARE, SHORT_STEP * robot.size)
-    own, begin = _Projection(rows, T[0, closed], control), _begin(rows, first)
-    origin = own.measure(begin, np.zeros(len(closed), bool))
-    point, _ = minimize_by_halving(origin, own.propose, own.move, control)
-    smallest = np.maximum(point.cost, (REACHED * robot.size) ** 2)
-    ended_early = own.propose(point).change > STATIONARY**2 * smallest
-    moved = np.flatnonzero((point.now.u != begin.u).any(axis=1))
+    rows = replace(_make_rows(robot, values, wanted[0, closed]), poses=T[0, closed])
+    begin = _begin(rows, first)
+    end = rows.iterate(begin)
+    ended_early = end.left > STATIONARY * np.maximum(end.gap, REACHED * robot.size)
+    moved = np.flatnonzero((end.u != begin.u).any(axis=1))
     state = replace(state, status=state.status.copy())
     if len(moved):
-        last = join_stage_states(robot, rows.list_states(point.now))
+        last = rows.join_states(end)
         last = map_arrays(lambda a: a[None, moved, 0], last)
         near = read_coordinates(last.T, robot.controlled)
         last = close_at_coordinates(robot, values, near, last, follow=False)

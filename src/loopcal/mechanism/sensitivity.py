@@ -13,7 +13,6 @@ Failed rows have NaN.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -139,17 +138,7 @@ def differentiate_by_drives(
         return out
     is_open = robot.program.may_stay_open
     differentiate = differentiate_open if is_open else engine.differentiate
-    return differentiate(robot.program, e, u, state, _map_drives(u.shape[2]))[1]
-
-
-@cache
-def _map_drives(count: int) -> engine.ParameterMap:
-    """Return the map of no parameters, and of readings that are the values of driven joints."""
-    pattern = engine.MapPattern(0, np.zeros((0, 2), np.int64), np.zeros((0, 3), np.int64))
-    none = np.zeros((1, 0))
-    return engine.ParameterMap(
-        pattern, none, none, np.zeros((1, 1, count, 0)), np.ones((1, 1, count))
-    )
+    return differentiate(robot.program, e, u, state, robot.program.drive_map)[1]
 
 
 def fold_pose_rows(
