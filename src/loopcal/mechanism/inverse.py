@@ -241,7 +241,7 @@ fewer on a path, whose targets are near.
 
 In ten steps the longest ones turn a joint by 5 rad. Steps close to a stretched arm gain less.
 """
-SHORT_SHARE = 1e-9
+SHORT_SHARE = 1e-8
 """Share of its distance from the target that a projected row must be able to lose, to first order,
 beside `CLOSE`, to go on."""
 DEPENDENT = 1e-9
@@ -365,18 +365,11 @@ class _Rows:
         step = np.zeros_like(now.u)
         step[:, self.moving] = moved[..., 0]
         step *= self.spans
-        # no joint moves farther than the longest step: in radians, or sizes of the robot
-        length = np.abs(step * self.units).max(axis=1, initial=0.0) / self.robot.size
-        longest = np.maximum(length, LONGEST_STEP)
         gap = left = np.where(ok, np.linalg.norm(residual, axis=1), np.inf)
         if self.poses is not None:
             left = np.where(ok, np.linalg.norm(np.matmul(slope, moved)[..., 0], axis=1), np.inf)
         return replace(
-            now,
-            gap=gap,
-            left=left,
-            step=step * (LONGEST_STEP / longest)[:, None],
-            sign=np.where(ok, sign, 0.0),
+            now, gap=gap, left=left, step=self.limit_steps(step), sign=np.where(ok, sign, 0.0)
         )
 
     def is_in_other_mode(self, now: _Iterate) -> BoolArray:
@@ -401,9 +394,9 @@ class _Rows:
         """
         size, R = self.robot.size, len(start.u)
         close = (CLOSE_ON_PATH if on_path else CLOSE) * size
-        period = PROGRESS_ON_PATH if on_path else PROGRESS_STEPS
+        period = PROGRESS_STEPS if self.poses is None and not on_path else PROGRESS_ON_PATH
         done = now = start
-        rows, alive, share = self, np.arange(R), np.ones(R)
+        rows, alive, share, step = self, np.arange(R), np.ones(R), start.step
         before = now.left
         for count in range(STEPS + 1):
             broken = ~np.isfinite(now.gap)
@@ -421,18 +414,40 @@ class _Rows:
                 if not len(keep) or count == STEPS:
                     break
                 rows, now = rows.select(keep), now.take(keep)
-                alive, share, before = alive[keep], share[keep], before[keep]
-            trial = rows.evaluate(now.u + share[:, None] * now.step, now.loops)
+                alive, share, before, step = (a[keep] for a in (alive, share, before, step))
+            trial = rows.evaluate(now.u + share[:, None] * step, now.loops)
             square = (1.0 + ROUNDED) * now.gap**2 - 2e-4 * share * now.left**2
             better = trial.gap <= np.maximum(np.sqrt(square.clip(min=0.0)), close)
             share = np.where(better, np.minimum(1.0, 4 * share), 0.25 * share)
+            last = now
             if better.all():
                 now = trial
             elif better.any():
                 chosen = np.flatnonzero(better)
                 now = now.put(chosen, trial.take(chosen))
+            step = now.step
+            if rows.poses is not None:  # a step that failed is followed by a plain one
+                share = np.where(better, 1.0, share)
+                step = np.where(better[:, None], rows.extrapolate(last, now), step)
         is_other = (done.status == CONVERGED) & self.is_in_other_mode(done)
         return replace(done, status=np.where(is_other, np.int8(Status.OTHER_MODE), done.status))
+
+    def extrapolate(self, last: _Iterate, now: _Iterate) -> FloatArray:
+        """Return steps (R, u) to where two iterates let their steps end, in a straight line.
+
+        Gauss-Newton steps towards a pose that is not reachable shrink by a nearly constant share.
+        Source: Anderson, J. ACM 12 (1965), with one step before.
+        """
+        moved, change = now.u - last.u, now.step - last.step
+        scaled = change / self.spans**2
+        square = (scaled * change).sum(axis=1, keepdims=True)
+        share = (scaled * now.step).sum(axis=1, keepdims=True) / np.where(square, square, 1.0)
+        return self.limit_steps(now.step - share * (moved + change))
+
+    def limit_steps(self, step: FloatArray) -> FloatArray:
+        """Return steps (R, u) that move no joint farther than the longest step."""
+        length = np.abs(step * self.units).max(axis=1, initial=0.0) / self.robot.size
+        return step * (LONGEST_STEP / np.maximum(length, LONGEST_STEP))[:, None]
 
     def join_states(self, now: _Iterate) -> State:
         """Return the state (R, 1) at an iterate."""

@@ -225,7 +225,7 @@ def solve_in_mode(
         return state
     status = np.where(is_other, np.int8(Status.OTHER_MODE), state.status)
     state = replace(state, status=status)
-    if has_one_solution(robot):
+    if has_one_solution(robot) or moves_by_drives(robot):  # which follows the path itself
         return state
     first = select_poses(repeat_poses(begin, len(is_other)), rows)
     near, arrived = _follow_poses(robot, first, select_poses(state, rows))
@@ -246,7 +246,7 @@ def _select_new(
     robot: Mechanism, again: State, state: State, rows: IntArray
 ) -> tuple[State, IntArray]:
     """Return the solutions (1, k) of rows (k,) that are not those of a state, and their rows."""
-    if robot.stages or not len(rows):
+    if not len(rows):
         return again, rows
     is_new = measure_distance(robot, again, select_poses(state, rows)) > SAME_JOINTS
     return select_poses(again, is_new), rows[is_new]
