@@ -156,20 +156,15 @@ def view_calibration(
     if fit.converged:
         shown, caption = stated["parameters"], "Parameters"
         if not verbose and len(shown) > MOST_LINES:
-            shown = _select_moved(shown)
+            moved = [abs(row["estimate"] - row["nominal"]) / row["tolerance"] for row in shown]
+            most = np.argsort(np.negative(moved), kind="stable")[:MOST_MOVED]
+            shown = [shown[i] for i in np.sort(most)]
             others = len(stated["parameters"]) - len(shown)
             caption = f"Parameters that moved most; {others} others are in the run and its report"
         blocks += _view_parameters(fit, caption, shown)
     elif verbose:
         blocks.append(build_last_value_table(stated["parameters"]))
     return [*blocks, *_view_details(report, stated)] if verbose else blocks
-
-
-def _select_moved(rows: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
-    """Return the rows of the parameters that moved most in their tolerances, in their order."""
-    moved = [abs(row["estimate"] - row["nominal"]) / row["tolerance"] for row in rows]
-    kept = np.sort(np.argsort(np.negative(moved), kind="stable")[:MOST_MOVED])
-    return [rows[i] for i in kept]
 
 
 def _view_details(report: CalibrationReport, stated: Mapping[str, Any]) -> list[Block]:
@@ -504,6 +499,12 @@ def view_identifiability(report: IdentifiabilityReport, verbose: bool = False) -
     observability indices.
     """
     analysis, useful = report.analysis, report.useful
+
+    def name_terms(row: Any) -> str:
+        """Return the strongest terms of a combination."""
+        pairs = zip(row.names, row.coefficients, strict=True)
+        return list_names([f"{c:+.2f} {name}" for name, c in pairs], 4).replace(" and ", ", ")
+
     blocks: list[Block] = [str(finding) for finding in report.summary]
     if (verbose and report.suggestions) or any(
         finding.severity is Severity.SUGGESTION for finding in report.summary
@@ -514,17 +515,17 @@ def view_identifiability(report: IdentifiabilityReport, verbose: bool = False) -
         left = [f for f in analysis.findings if f.code not in said]
         combinations = [str(f) for f in left if f.code in COMBINATIONS]
         blocks += ["", *(str(f) for f in left if f.code not in COMBINATIONS)]
-        blocks += _shorten(combinations, "combinations")
-        blocks += _shorten([str(suggestion) for suggestion in report.suggestions], "suggestions")
+        listed = {"combinations": combinations, "suggestions": [*map(str, report.suggestions)]}
+        for what, lines in listed.items():
+            blocks += lines[:MOST_COMBINATIONS]
+            if (left_out := len(lines) - MOST_COMBINATIONS) > 0:
+                blocks.append(f"and {left_out} more {what}")
     if useful is not None and verbose:  # the best and the worst known ones about it
         n = MOST_COMBINATIONS
         table = build_table(
             "Combinations next to the useful accuracy",
             [*useful.determined[-n:], *useful.undetermined[:n]],
-            (
-                word_column("combination of length one", wraps=True),
-                lambda row: _name_terms(row.names, row.coefficients),
-            ),
+            (word_column("combination of length one", wraps=True), name_terms),
             Field("sd", title="sd / useful accuracy", digits=3),
         )
         blocks.append(table)
@@ -544,15 +545,3 @@ def view_identifiability(report: IdentifiabilityReport, verbose: bool = False) -
     if report.subset is not None:
         blocks += ["", str(report.subset)]
     return blocks
-
-
-def _shorten(lines: Sequence[str], what: str) -> list[Block]:
-    """Return the first lines and the number of the others."""
-    left = len(lines) - MOST_COMBINATIONS
-    return [*lines[:MOST_COMBINATIONS], *([f"and {left} more {what}"] if left > 0 else [])]
-
-
-def _name_terms(names: Sequence[str], coefficients: FloatArray) -> str:
-    """Return the strongest terms of a combination."""
-    terms = [f"{c:+.2f} {name}" for name, c in zip(names, coefficients, strict=True)]
-    return list_names(terms, 4).replace(" and ", ", ")

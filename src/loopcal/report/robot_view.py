@@ -44,12 +44,17 @@ def view_robot(inspection: RobotInspection) -> list[Block]:
     n, free = len(robot.parameters), int(robot.parameters.free.sum())
     commanded = sum(actuator.reference is None for actuator in robot.actuators)
     actuators, parameters = name_count(commanded, "actuator"), name_count(n, "parameter")
+    loads, load, length = [], robot.assembly.load, robot.get_unit(Dimension.LENGTH)
+    if robot.is_elastic:
+        at = ", ".join(format_in(length, x) for x in load.at)
+        axes = f"axes of the {'platform' if load.of_platform else 'base'}"
+        loads = [f"load: force and moment in {axes}, at [{at}] {length} of the platform"]
     blocks: list[Block] = [
         f"{robot.name}: {actuators}, {parameters}, {free} free",
         f"file: {robot.record.path}",
         f"freedoms: {' '.join(robot.freedoms)}",
         f"commanded in: {' '.join(robot.controlled)}",
-        *_describe_load(robot),
+        *loads,
         *format_list([(f.severity.value, str(f)) for f in inspection.findings]),
     ]
     tables = (
@@ -60,15 +65,6 @@ def view_robot(inspection: RobotInspection) -> list[Block]:
         _build_common_error_table(robot),
     )
     return [*blocks, *(table for table in tables if table.rows)]
-
-
-def _describe_load(robot: Mechanism) -> list[str]:
-    """Return where the load of an elastic robot acts, and in which axes."""
-    load, unit = robot.assembly.load, robot.get_unit(Dimension.LENGTH)
-    at = ", ".join(format_in(unit, x) for x in load.at)
-    axes = "platform" if load.of_platform else "base"
-    text = f"load: force and moment in axes of the {axes}, at [{at}] {unit} of the platform"
-    return [text] if robot.is_elastic else []
 
 
 def _build_actuator_table(inspection: RobotInspection) -> Table:
@@ -225,28 +221,22 @@ def _build_transmission_table(robot: Mechanism, units: Units) -> Table:
     """Return the terms that are not zero."""
     rows = []
     for actuator in robot.assembly.rows:
-        joint_unit = units[_joint_dimension(robot, actuator.name)]
         limbs, driven = robot.assembly.limbs, actuator.driven_joints
         named = ((limb.name, joint) for limb in limbs for joint in limb.joints)
         joints = [f"{limb}/{joint.name}" for limb, joint in named if joint.actuator in driven]
         joints += [f"{limb.name}/rod" for limb in limbs if limb.actuator in driven]
-        first = (actuator.name, ", ".join(joints))
-        for term, value in {"gain": 1.0, **actuator.terms}.items():
-            if value and term not in TRIANGLE_TERMS:
-                power = POWERS.get(term, 0)
+        terms = {"gain": 1.0, **actuator.terms}
+        shown = {term: x for term, x in terms.items() if x and term not in TRIANGLE_TERMS}
+        shown |= {f"{WEIGHT}{joint}": weight for joint, weight in actuator.weights.items()}
+        for term, value in shown.items():
+            factor, unit = _unit_of_term(robot, actuator.name, term, units)
+            at = ""
+            if term.startswith(TABLE):
+                point = actuator.points[int(term.removeprefix(TABLE)) - 1]
                 reading = units[_find_reading(robot, actuator.name, term)]
-                number = value * reading.factor_to_si**power / joint_unit.factor_to_si
-                unit = _unit_of_term(joint_unit, reading, power)
-                at = ""
-                if term.startswith(TABLE):
-                    point = actuator.points[int(term.removeprefix(TABLE)) - 1]
-                    at = f" at {_format(point, reading)} {reading}"
-                rows.append((*first, term + at, format_number(number, DIGITS), unit))
-        for joint, weight in actuator.weights.items():
-            number, unit = weight, "1"
-            if _is_radius(robot, actuator.name, joint):
-                number, unit = weight / joint_unit.factor_to_si, f"{joint_unit}/rad"
-            rows.append((*first, f"{WEIGHT}{joint}", format_number(number, DIGITS), unit))
+                at = f" at {_format(point, reading)} {reading}"
+            number = format_number(value / factor, DIGITS)
+            rows.append((actuator.name, ", ".join(joints), term + at, number, unit))
     drives = word_column("drives", wraps=True)
     columns = ("actuator", drives, "term", Column("value"), "unit")
     return make_table("Transmissions: from reading to joint value", columns, rows)
@@ -290,26 +280,27 @@ def _place(T: np.ndarray, units: Units) -> tuple[str, ...]:
     return lengths + tuple(_format(float(a), units[Dimension.ANGLE]) for a in angles)
 
 
-def _unit_of_term(joint: Unit, reading: Unit, power: int) -> str:
-    """Return the unit of a term of a transmission."""
+def _unit_of_term(robot: Mechanism, owner: str, term: str, units: Units) -> tuple[float, str]:
+    """Return factor to SI and symbol of a term of a transmission, or of a weight of a sum."""
+    length, angle = units[Dimension.LENGTH], units[Dimension.ANGLE]
+    if term.startswith(WEIGHT):
+        is_radius = _is_radius(robot, owner, term.removeprefix(WEIGHT))
+        return (length.factor_to_si, f"{length}/rad") if is_radius else (1.0, "1")
+    if term in ("skew.x", "skew.y"):
+        return angle.factor_to_si, angle.symbol
+    joint, reading = units[_joint_dimension(robot, owner)], units[_find_reading(robot, owner, term)]
+    power = POWERS.get(term, 0)
+    symbol = f"{joint}/{reading}" + (f"^{power}" if power > 1 else "")
     if power == 0 or (power == 1 and joint == reading):
-        return "1" if power else joint.symbol
-    return f"{joint}/{reading}" + (f"^{power}" if power > 1 else "")
+        symbol = "1" if power else joint.symbol
+    return joint.factor_to_si / reading.factor_to_si**power, symbol
 
 
 def _unit_of_address(robot: Mechanism, address: Address, units: Units) -> tuple[float, str]:
     """Return factor to SI and symbol of what an address changes."""
     length = units[Dimension.LENGTH]
     if address.element == "transmission":
-        reading = units[_find_reading(robot, address.owner, address.axis)]
-        if address.axis.startswith(WEIGHT):
-            is_radius = _is_radius(robot, address.owner, address.axis.removeprefix(WEIGHT))
-            return (length.factor_to_si, f"{length}/rad") if is_radius else (1.0, "1")
-        if address.axis in ("skew.x", "skew.y"):
-            return units[Dimension.ANGLE].factor_to_si, units[Dimension.ANGLE].symbol
-        joint, power = units[_joint_dimension(robot, address.owner)], POWERS.get(address.axis, 0)
-        factor = joint.factor_to_si / reading.factor_to_si**power
-        return factor, _unit_of_term(joint, reading, power)
+        return _unit_of_term(robot, address.owner, address.axis, units)
     if address.axis == "pitch":
         return length.factor_to_si, f"{length}/rad"
     unit = units[Dimension.ANGLE] if address.axis in ("rx", "ry", "rz") else length

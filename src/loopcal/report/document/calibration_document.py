@@ -121,19 +121,12 @@ def describe_summary(record: CalibrationRecord) -> Iterator[Element]:
     result = make_table("Result", columns, _list_results(record))
     yield result if result.rows else say("summary.no-result")
     judged = [each for each in (volume, record.result.get("validation") or {}) if each]
-    rules = [rule for each in judged for rule in _list_rules(each.get("conformity"))]
+    decided = [c for each in judged if (c := each.get("conformity"))]  # one, or by quantity
+    rules = [rule for c in decided for rule in ([c] if "rule" in c else c.values())]
     yield say("summary.volume", **volume) if volume else say("summary.no-volume")
     yield say("summary.rule", **rules[0]) if rules else say("summary.no-rule")
     yield say("summary.validity")
     yield Form((*((name, facts.get(name, "")) for name in SIGNATURE), ("signature", "")))
-
-
-def _list_rules(conformity: Mapping[str, Any] | None) -> list[Mapping[str, Any]]:
-    """Return the decision rules of a statement, or of statements by quantity."""
-    if not conformity:
-        return []
-    each = [conformity] if "rule" in conformity else conformity.values()
-    return [{"rule": one["rule"], "level": 100.0 * one["level"]} for one in each]
 
 
 def _name_instrument(facts: Mapping[str, str]) -> str:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 
 from loopcal.apply.run_comparison import RunComparison
@@ -43,50 +43,31 @@ SUMMARIES: Mapping[bool | None, str] = {True: "changed", False: "equal", None: "
 
 def build_comparison_document(comparison: RunComparison, made_by: str) -> Document:
     """Return a comparison as a document; made_by : program and version."""
-    names = ", ".join(run.name for run in comparison.runs)
-    sections: dict[tuple[str, str], Callable[[RunComparison], Iterator[Element]]] = {
-        ("result", "Changes of the machine"): _describe_result,
-        ("parameters", "Parameters side by side"): _describe_parameters,
-        ("shifts", "Shifts in standard deviations"): _describe_shifts,
-        ("errors", "Held-out errors"): _describe_errors,
+    names, first = ", ".join(run.name for run in comparison.runs), comparison.runs[0].name
+    result: list[Element] = [say("comparison.meaning")]
+    if findings := sort_by_importance(comparison.findings):  # the most important first
+        result.append(Listing(tuple((f.severity.value, str(f)) for f in findings)))
+    estimates = show_figure(draw_run_parameters(comparison), "estimates-figure")
+    shifts: list[Element] = [say("comparison.no-shift")]
+    if any(pair.moved is not None for pair in comparison.pairs):
+        figure = show_figure(draw_run_shifts(comparison), "shift-figure")
+        shifts = [figure, build_shifts(comparison)]
+    errors: list[Element] = [build_errors(comparison)]
+    if any(run.common or run.own for run in comparison.errors):
+        errors.append(show_figure(draw_run_errors(comparison), "errors-figure"))
+    sections: dict[tuple[str, str], list[Element]] = {
+        ("result", "Changes of the machine"): [*result, build_runs(comparison)],
+        ("parameters", "Parameters side by side"): [build_estimates(comparison), estimates],
+        ("shifts", "Shifts in standard deviations"): shifts,
+        ("errors", "Held-out errors"): errors,
     }
     return Document(
         title=f"Comparison of calibrations: {names}",
         verdict=HEADS[comparison.moved],
-        summary=say(f"comparison.{SUMMARIES[comparison.moved]}", first=comparison.runs[0].name),
+        summary=say(f"comparison.{SUMMARIES[comparison.moved]}", first=first),
         made_by=made_by,
-        sections=tuple(Section(*n, tuple(each(comparison))) for n, each in sections.items()),
+        sections=tuple(Section(*named, tuple(each)) for named, each in sections.items()),
     )
-
-
-def _describe_result(comparison: RunComparison) -> Iterator[Element]:
-    """Yield the findings, the most important first, and the runs."""
-    yield say("comparison.meaning")
-    if findings := sort_by_importance(comparison.findings):
-        yield Listing(tuple((finding.severity.value, str(finding)) for finding in findings))
-    yield build_runs(comparison)
-
-
-def _describe_parameters(comparison: RunComparison) -> Iterator[Element]:
-    """Yield estimates with intervals, side by side."""
-    yield build_estimates(comparison)
-    yield show_figure(draw_run_parameters(comparison), "estimates-figure")
-
-
-def _describe_shifts(comparison: RunComparison) -> Iterator[Element]:
-    """Yield the tested shifts in standard deviations."""
-    if all(pair.moved is None for pair in comparison.pairs):
-        yield say("comparison.no-shift")
-        return
-    yield show_figure(draw_run_shifts(comparison), "shift-figure")
-    yield build_shifts(comparison)
-
-
-def _describe_errors(comparison: RunComparison) -> Iterator[Element]:
-    """Yield the errors after calibration, at common poses or at those of each run."""
-    yield build_errors(comparison)
-    if any(run.common or run.own for run in comparison.errors):
-        yield show_figure(draw_run_errors(comparison), "errors-figure")
 
 
 # The page of `loopcal view`: a robot in space, of a calibration with its poses and errors.

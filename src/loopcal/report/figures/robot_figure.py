@@ -34,14 +34,12 @@ from loopcal.report.figures.style import (
 )
 from loopcal.report.scene.scene import Part, Role, Scene, is_planar, list_parts
 from loopcal.results.presenters import register
-from loopcal.results.tables import choose_unit
 from loopcal.typing import FloatArray
-from loopcal.units import DISPLAY_UNITS, Dimension, find_unit
+from loopcal.units import Dimension, find_unit
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from loopcal.apply.accuracy import AccuracyMap
 
 FLAT = 0.05
 """Width of an upright plane that contains a machine, as a share of its largest extent."""
@@ -198,7 +196,7 @@ def draw_scene(scene: Scene) -> Figure:
     factor, flat = find_unit(robot.units[Dimension.LENGTH]).factor_to_si, [*choose_view(robot)]
     panels = [(axes, [0, 1, 2] if axes.name == "3d" else flat) for axes in figure.axes]
     if scene.accuracy is not None:
-        _draw_map(figure, panels, scene, scene.accuracy, factor)
+        _draw_map(figure, panels, scene, factor)
     if poses is None:
         return figure
     tips = poses.tool + poses.magnification * poses.error
@@ -215,15 +213,10 @@ def draw_scene(scene: Scene) -> Figure:
 
 
 def _draw_map(
-    figure: Figure,
-    panels: list[tuple[Any, list[int]]],
-    scene: Scene,
-    accuracy: AccuracyMap,
-    factor: float,
+    figure: Figure, panels: list[tuple[Any, list[int]]], scene: Scene, factor: float
 ) -> None:
     """Draw the uncertainty of positions where it is known, with its scale of colors."""
-    unit = choose_unit(DISPLAY_UNITS[Dimension.LENGTH], accuracy.uncertainty.position)
-    values = accuracy.uncertainty.position / unit.factor_to_si
+    values, unit = scene.map_values
     known = np.isfinite(values) & np.isfinite(scene.map_points).all(axis=1)
     if not known.any():
         return

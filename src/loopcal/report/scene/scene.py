@@ -92,6 +92,13 @@ class Scene:
             return np.zeros((0, 3))
         return (self.accuracy.uncertainty.T @ self.robot.tool)[:, :3, 3]
 
+    @property
+    def map_values(self) -> tuple[FloatArray, Unit]:
+        """(n,) rms position uncertainty at these points, in a unit that suits its size."""
+        values = np.zeros(0) if self.accuracy is None else self.accuracy.uncertainty.position
+        unit = choose_unit(DISPLAY_UNITS[Dimension.LENGTH], values)
+        return values / unit.factor_to_si, unit
+
 
 def compute_pose_errors(
     robot: Mechanism, initial: Mechanism, readings: FloatArray, labels: tuple[str, ...]
@@ -462,11 +469,8 @@ def _describe_map(scene: Scene, unit: Unit) -> dict[str, Any] | None:
     from matplotlib import colormaps
     from matplotlib.colors import Normalize, to_hex
 
-    if scene.accuracy is None:
-        return None
-    points, values = scene.map_points, scene.accuracy.uncertainty.position
-    reached = np.isfinite(points).all(axis=1)
-    known = np.isfinite(values)
+    points, (values, length) = scene.map_points, scene.map_values
+    reached, known = np.isfinite(points).all(axis=1), np.isfinite(values)
     if not (reached & known).any():
         return None
     scale = Normalize(values[known].min(), values[known].max())
@@ -474,27 +478,26 @@ def _describe_map(scene: Scene, unit: Unit) -> dict[str, Any] | None:
         to_hex(colormaps[SEQUENTIAL](scale(value))) if np.isfinite(value) else UNBOUNDED
         for value in values[reached]
     ]
-    shown, largest = (
-        points[reached],
-        int(np.argmax(np.where(known[reached], values[reached], -1.0))),
-    )
-    hull = np.zeros((0, 3), dtype=int)
+    shown, values = points[reached], np.where(known, values, -1.0)[reached]
+    largest, hull = int(np.argmax(values)), np.zeros((0, 3), dtype=int)
     if len(shown) > 3 and np.linalg.matrix_rank(shown - shown[0], tol=1e-3 * scene.robot.size) == 3:
         from scipy.spatial import ConvexHull
 
         hull = ConvexHull(shown).simplices
-    length = choose_unit(DISPLAY_UNITS[Dimension.LENGTH], values)
-    most = values[reached][largest] / length.factor_to_si
+    most = f"largest: {format_number(values[largest], 2)} {length.symbol}"
     return {
         "points": _encode(shown / unit.factor_to_si),
         "colors": shades,
         "hull": hull.ravel().tolist(),
-        "largest": {"index": largest, "text": f"largest: {format_number(most, 2)} {length.symbol}"},
+        "largest": {"index": largest, "text": most},
     }
 
 
 def _list_legend(scene: Scene, parts: tuple[Part, ...]) -> list[dict[str, str]]:
-    """Return the colors of the scene and their meaning."""
+    """Return the colors of the scene and their meaning, with the scale of the accuracy map."""
+    from matplotlib import colormaps
+    from matplotlib.colors import to_hex
+
     robot, poses = scene.robot, scene.poses
     platforms = (part.points[0] for part in parts if part.role == "platform")
     has_platform = any(np.ptp(points, axis=0).max() > 1e-6 * robot.size for points in platforms)
@@ -509,27 +512,11 @@ def _list_legend(scene: Scene, parts: tuple[Part, ...]) -> list[dict[str, str]]:
         error = f"position error before calibration, {poses.magnification:g} times magnified"
         rows += [(POSE, "tool at a measured pose", len(poses.tool) > 0)]
         rows += [(ERROR, error, len(poses.tool) > 0)]
-    rows += _describe_scale(scene)
+    values, unit = scene.map_values
+    if len(known := values[np.isfinite(values)]):
+        stops = [to_hex(colormaps[SEQUENTIAL](share)) for share in np.linspace(0.0, 1.0, 5)]
+        ends = " to ".join(f"{value:.3g}" for value in (known.min(), known.max()))
+        text = f"position uncertainty (rms) over the workspace, {ends} {unit.symbol}"
+        rows += [(f"linear-gradient(to right, {', '.join(stops)})", text, True)]
+        rows += [(UNBOUNDED, "uncertainty not bounded by the data", len(known) < len(values))]
     return [{"color": color, "text": text} for color, text, is_drawn in rows if is_drawn]
-
-
-def _describe_scale(scene: Scene) -> tuple[tuple[str, str, bool], ...]:
-    """Return the legend of the accuracy map."""
-    from matplotlib import colormaps
-    from matplotlib.colors import to_hex
-
-    if scene.accuracy is None:
-        return ()
-    values = scene.accuracy.uncertainty.position
-    unit = choose_unit(DISPLAY_UNITS[Dimension.LENGTH], values)
-    known = values[np.isfinite(values)] / unit.factor_to_si
-    if not len(known):
-        return ()
-    stops = [to_hex(colormaps[SEQUENTIAL](share)) for share in np.linspace(0.0, 1.0, 5)]
-    ends = " to ".join(f"{value:.3g}" for value in (known.min(), known.max()))
-    text = f"position uncertainty (rms) over the workspace, {ends} {unit.symbol}"
-    unbounded = bool(len(known) < len(values))
-    return (
-        (f"linear-gradient(to right, {', '.join(stops)})", text, True),
-        (UNBOUNDED, "uncertainty not bounded by the data", unbounded),
-    )
