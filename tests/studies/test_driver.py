@@ -85,7 +85,7 @@ def test_study_in_python_returns_its_results(undisturbed) -> None:
     summary = result.summarize()
     assert summary.is_complete
     assert summary.trials == CELLS * 20
-    frame, data = result.to_pandas(), result.to_xarray()
+    frame, data = result.to_frame(), result.to_dataset()
     assert len(frame) == CELLS * 20
     cell = frame[(frame.poses == "12") & (frame.method == "map")]
     chosen = data.position.sel({"poses": "12", "method": "map"}).squeeze()

@@ -253,7 +253,7 @@ def test_a_cell_without_trials_and_one_with_few_have_no_false_bounds(tmp_path: P
 def test_views_contain_every_trial_with_its_factors(result: StudyResult) -> None:
     pytest.importorskip("pandas")
     pytest.importorskip("xarray")
-    table, data = result.to_pandas(), result.to_xarray()
+    table, data = result.to_frame(), result.to_dataset()
     assert len(table) == 4800
     cell = result.study.cells[5]
     expected = draw_scores(cell)["position"]

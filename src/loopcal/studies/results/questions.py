@@ -12,10 +12,12 @@ therefore wrong in at most 5 % of studies. A trial that failed is a machine that
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Literal
@@ -25,7 +27,15 @@ import numpy as np
 from loopcal.findings import report_finding
 from loopcal.findings.catalog import find_entry
 from loopcal.io.core.text_file import to_json, write_bytes, write_text
-from loopcal.results.tables import ABSENT, Block, Column, Table, format_number, word_column
+from loopcal.results.tables import (
+    ABSENT,
+    Block,
+    Column,
+    Table,
+    build_table,
+    format_number,
+    word_column,
+)
 from loopcal.studies.files.store import StudyStore
 from loopcal.studies.results.study_result import (
     BEFORE,
@@ -372,37 +382,35 @@ def tabulate_medians(study: Study, summary: StudySummary, names: Sequence[str]) 
     """Return a table of the varied factors, the failed trials by reason, and the medians or mean
     shares of some scores, those of pose errors beside the medians before calibration.
     """
-    factors = study.varied_factors or tuple(study.levels)[:1]
     units = {column.name: UNITS[column.unit] for column in study.columns}
-    is_unfinished = any(cell.unfinished for cell in summary.cells)
-    columns = [word_column(factor, wraps=True) for factor in factors]
-    columns += [Column("trials"), word_column("failed", wraps=True)]
-    columns += [Column("at step limit")] if is_unfinished else []
-    shown = [n for name in names for n in (_name_before(name), name) if n in units]
-    for name in shown:
-        symbol = units[name].symbol
-        columns.append(Column(name.replace("_", " "), "" if symbol == "1" else symbol))
-    rows = []
-    for cell in summary.cells:
-        row = [*(cell.levels[f] for f in factors), str(cell.trials), say_failures(cell.failed)]
-        row += [str(cell.unfinished)] if is_unfinished else []
-        for name in shown:
-            score = cell.find_score(name)
-            interval = None if score is None else score.median or score.mean
-            if interval is None:
-                row.append(ABSENT)
-            elif name in names:
-                row.append(_say_interval(interval, units[name]))
-            else:
-                row.append(format_number(interval.value / units[name].factor_to_si, 3))
-        rows.append(tuple(row))
-    return Table("", tuple(columns), tuple(rows))
+    columns: list[tuple[Column, Callable[[CellSummary], str]]] = [
+        (word_column(factor, wraps=True), lambda cell, factor=factor: cell.levels[factor])
+        for factor in study.varied_factors or tuple(study.levels)[:1]
+    ]
+    columns.append((Column("trials"), lambda cell: str(cell.trials)))
+    columns.append((word_column("failed", wraps=True), lambda cell: say_failures(cell.failed)))
+    if any(cell.unfinished for cell in summary.cells):
+        columns.append((Column("at step limit"), lambda cell: str(cell.unfinished)))
+    for name in names:
+        kind = "_max" * name.endswith("_max")
+        before = f"{name.removesuffix('_max')}{BEFORE}{kind}"
+        for shown in (each for each in (before, name) if each in units):
+            unit, has_ends = units[shown], shown == name
 
+            def show(
+                cell: CellSummary, shown: str = shown, unit: Unit = unit, has_ends: bool = has_ends
+            ) -> str:
+                score = cell.find_score(shown)
+                interval = None if score is None else score.median or score.mean
+                if interval is None:
+                    return ABSENT
+                ends = (interval.value, interval.low, interval.high)
+                value, low, high = (format_number(end / unit.factor_to_si, 3) for end in ends)
+                return f"{value} ({low} to {high})" if has_ends else value
 
-def _name_before(name: str) -> str:
-    """Return the name of a score before calibration, such as position_before_max."""
-    kind = "_max" if name.endswith("_max") else ""
-    return f"{name.removesuffix('_max')}{BEFORE}{kind}"
+            symbol = "" if unit.symbol == "1" else unit.symbol
+            columns.append((Column(shown.replace("_", " "), symbol), show))
+    return build_table("", summary.cells, *columns)
 
 
 def say_failures(failed: Mapping[str, int]) -> str:
@@ -416,43 +424,31 @@ def name_outcome(code: str) -> str:
     return code.partition(".")[2].replace("-", " ")
 
 
-def _say_interval(interval: Interval, unit: Unit) -> str:
-    """Return `value (low to high)` in a unit."""
-    ends = (interval.value, interval.low, interval.high)
-    return "{} ({} to {})".format(*(format_number(end / unit.factor_to_si, 3) for end in ends))
-
-
 def tabulate_all(study: Study, summary: StudySummary) -> Table:
     """Return a table of all factors and all scores in SI, with intervals, for programs."""
     kinds = {"median": " median", "high": " 95 %", "mean": " mean"}
-
-    def find(cell: CellSummary, score: str, kind: str) -> Interval | None:
-        return getattr(cell.find_score(score), kind, None)
-
-    present = [
-        (column, kind)
-        for column in study.columns[1:]
-        for kind in kinds
-        if any(find(cell, column.name, kind) for cell in summary.cells)
-    ]
-    columns = [word_column(factor) for factor in study.levels]
-    columns += [Column(name) for name in ("trials", "failed", "unfinished")]
     reasons = dict.fromkeys(code for cell in summary.cells for code in cell.failed)
-    columns += [Column(name) for name in (*map(name_outcome, reasons), "converged")]
-    columns += [
-        Column(f"{c.name}{kinds[kind]}{suffix}", "" if c.unit == "1" else c.unit)
-        for c, kind in present
-        for suffix in ("", " low", " high")
+    columns: list[tuple[Column, Callable[[CellSummary], str]]] = [
+        *((word_column(f), lambda cell, f=f: cell.levels[f]) for f in study.levels),
+        (Column("trials"), lambda cell: str(cell.trials)),
+        (Column("failed"), lambda cell: str(sum(cell.failed.values()))),
+        (Column("unfinished"), lambda cell: str(cell.unfinished)),
+        *((Column(name_outcome(c)), lambda cell, c=c: str(cell.failed.get(c, 0))) for c in reasons),
+        (Column("converged"), lambda cell: show(cell.converged.value)),
     ]
-    rows = []
-    for cell in summary.cells:
-        numbers = [cell.converged.value]
-        for column, kind in present:
-            found = find(cell, column.name, kind)
-            numbers += [math.nan] * 3 if found is None else [found.value, found.low, found.high]
-        row = [*(cell.levels[factor] for factor in study.levels), str(cell.trials)]
-        row += map(str, (sum(cell.failed.values()), cell.unfinished))
-        row += [str(cell.failed.get(code, 0)) for code in reasons]
-        row += [repr(float(x)) if math.isfinite(x) else "" for x in numbers]
-        rows.append(tuple(row))
-    return Table("", tuple(columns), tuple(rows))
+
+    def show(number: float) -> str:
+        return repr(float(number)) if math.isfinite(number) else ""
+
+    for score, kind in itertools.product(study.columns[1:], kinds):
+
+        def find(cell: CellSummary, end: str, score: str = score.name, kind: str = kind) -> str:
+            interval = getattr(cell.find_score(score), kind, None)
+            return show(getattr(interval, end, math.nan))
+
+        if any(find(cell, "value") for cell in summary.cells):
+            for end, suffix in (("value", ""), ("low", " low"), ("high", " high")):
+                title = f"{score.name}{kinds[kind]}{suffix}"
+                heading = Column(title, "" if score.unit == "1" else score.unit)
+                columns.append((heading, partial(find, end=end)))
+    return build_table("", summary.cells, *columns)

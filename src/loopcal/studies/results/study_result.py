@@ -62,14 +62,6 @@ class StudyResult(TableResult):
         shown = list_shown(self.study, summary)
         return render_html(view_summary(self.study, summary, shown))
 
-    def to_frame(self) -> Any:
-        """Return all trials as a pandas DataFrame; see `to_pandas`."""
-        return self.to_pandas()
-
-    def to_dataset(self) -> Any:
-        """Return all trials as an xarray Dataset; see `to_xarray`."""
-        return self.to_xarray()
-
     def summarize(self) -> StudySummary:
         """Return medians, quantiles and coverage of all cells, with intervals."""
         with read_store(self.folder) as store:
@@ -141,7 +133,7 @@ class StudyResult(TableResult):
         with read_store(self.folder) as store:
             return read_trials(self.study, store, chosen, places)[1]
 
-    def to_pandas(self) -> Any:
+    def to_frame(self) -> Any:
         """Return all trials as a pandas DataFrame: factors, trial, and scores in SI.
 
         Raises
@@ -161,7 +153,7 @@ class StudyResult(TableResult):
         columns = {column.name: scores[:, i] for i, column in enumerate(study.columns)}
         return pandas.DataFrame({**factors, "trial": trials, **columns})
 
-    def to_xarray(self) -> Any:
+    def to_dataset(self) -> Any:
         """Return all trials as an xarray Dataset: a variable for each score, with its unit, whose
         dimensions are the factors and the trial, as in `data.position.sel({"poses": "12"})`.
         Trials that are not stored are NaN.

@@ -150,13 +150,6 @@ def fit_together(cell: PreparedCell, trials: Trials, threads: int = 1) -> Fitted
     )
 
 
-def choose_rule(method: MethodLevel) -> StepRule:
-    """Return when the steps of raw fits end."""
-    if method.steps is not None:
-        return StepRule(method.epsilon or 0.0, method.steps)
-    return StepRule(EPSILON if method.epsilon is None else method.epsilon, LIMIT)
-
-
 def fit_per_leg(robot: Mechanism, data: Measurements, method: MethodLevel) -> PerLegEstimate:
     """Fit leg by leg. EstimationError as of `identify_per_leg`."""
     steps, epsilon = method.steps or LEG_STEPS, method.epsilon or 0.0
@@ -192,8 +185,9 @@ def fit_published(cell: PreparedCell, trials: Trials) -> FittedTrials:
             penalty = penalize_ridge(np.array([lam]), p)
         elif method.method == "truncated-svd":
             penalty = penalize_truncated(np.array([method.keep]), p)
-        steps = take_steps(raw, penalty, choose_rule(method))
         is_counted = method.epsilon is None and method.steps is not None
+        epsilon = 0.0 if is_counted else method.epsilon or EPSILON
+        steps = take_steps(raw, penalty, StepRule(epsilon, method.steps or LIMIT))
         outcome = np.where(steps.is_converged | is_counted, 0, STEPS_REMAIN)
         outcome = np.where(steps.is_diverged, DIVERGED, outcome)
         values, iterations = steps.values, steps.count

@@ -155,23 +155,6 @@ def make_instrument(level: InstrumentLevel, noise: NoiseLevel) -> Instrument:
     return instrument
 
 
-def place_instrument(
-    instrument: Instrument, robot: Mechanism, level: PosesLevel, coordinates: FloatArray
-) -> Instrument:
-    """Return an instrument at its poses (n, c): on the planes and lines of their groups, where the
-    level puts them there.
-
-    Raises DataError: points on planes and lines, and an instrument for something else.
-    """
-    if not level.is_on_surfaces:
-        return instrument
-    check_surfaces(instrument)
-    noise = {sensor.kind.name: sensor.noise for sensor in instrument.sensors}
-    axis = find_line_axes(robot, coordinates, level.groups)
-    points = np.arange(len(coordinates)).reshape(level.groups, -1)
-    return make_plane_line_instrument(robot, axis, points, lambda name, _: noise[name])
-
-
 def check_surfaces(instrument: Instrument) -> None:
     """Raise DataError where an instrument does not touch planes and lines."""
     kinds = [sensor.kind.name for sensor in instrument.sensors]
@@ -215,7 +198,7 @@ def measure_held_points(
     return Trials(
         assigned,
         layout.robot.name,
-        layout.commanded_readings,
+        compute_readings(layout.robot, layout.robot.parameters.nominal[None], layout.state)[0],
         tuple(np.zeros(shape) for shape in gaps),
         truth,
         state.T,
@@ -278,7 +261,12 @@ def compute_poses(description: Mapping[str, Any]) -> CellPoses:
     if level.coordinates:
         measured = np.array(level.coordinates)
     elif level.is_on_surfaces:
-        measured = plan_plane_line_points(robot.nominal, level, stream)
+        # cells that differ in tolerances, noise or method have the same points
+        groups = make_groups(robot.nominal, level)
+        is_complete = level.count - 2 * level.groups >= len(groups.free)
+        drawn = groups.draw(level.groups, stream)
+        design = improve_groups(groups, drawn, level.sweeps, is_complete).design
+        measured = groups.place_points(design).reshape(level.count, -1)
     elif level.choice == "tilts":
         measured = list_tilt_rings(robot.nominal, level.count)
     elif not is_planned(level):
@@ -296,19 +284,6 @@ def make_groups(robot: Mechanism, level: PosesLevel) -> PlaneLineGroups:
     does not follow them.
     """
     return PlaneLineGroups(robot, level.count // level.groups, SURFACE_SIGMA, (level.axis,))
-
-
-def plan_plane_line_points(
-    robot: Mechanism, level: PosesLevel, seed: int | np.random.Generator
-) -> FloatArray:
-    """Return coordinates (n, c) of points on planes and perpendicular lines; cells that differ in
-    tolerances, noise or method have the same points.
-    """
-    planned = make_groups(robot, level)
-    drawn, equations = planned.draw(level.groups, seed), level.count - 2 * level.groups
-    is_complete = equations >= len(planned.free)
-    design = improve_groups(planned, drawn, level.sweeps, is_complete).design
-    return planned.place_points(design).reshape(level.count, -1)
 
 
 def is_planned(level: PosesLevel) -> bool:
@@ -478,9 +453,13 @@ def _prepare(text: str) -> PreparedCell:
     robot = change_tolerances(build_robot_of(content.robot), content.errors).nominal
     measured, poses = np.array(content.measured), content.poses
     instrument = make_instrument(content.instrument, content.noise)
-    instrument = place_instrument(instrument, robot, poses, measured)
     layout = None
     if poses.is_on_surfaces:
+        check_surfaces(instrument)
+        noise = {sensor.kind.name: sensor.noise for sensor in instrument.sensors}
+        axis = find_line_axes(robot, measured, poses.groups)
+        points = np.arange(len(measured)).reshape(poses.groups, -1)
+        instrument = make_plane_line_instrument(robot, axis, points, lambda name, _: noise[name])
         layout = Layout(robot, measured.reshape(poses.groups, -1, measured.shape[1]))
     motions = np.zeros((12, 0))
     if content.scores.error_frame != BASE:

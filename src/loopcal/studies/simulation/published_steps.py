@@ -575,11 +575,6 @@ class Layout:
         return inverse_trials(self.robot, self.robot.parameters.nominal[None], self.flat[None])
 
     @cached_property
-    def commanded_readings(self) -> FloatArray:
-        """(n, a) readings of the machine as designed at the points."""
-        return compute_readings(self.robot, self.robot.parameters.nominal[None], self.state)[0]
-
-    @cached_property
     def levers(self) -> tuple[FloatArray, FloatArray]:
         """d_1 (g, 3) and d_i (g, k - 2, 3) [m] as commanded."""
         points = (self.state.T[0] @ self.robot.tool)[:, :3, 3]
@@ -649,8 +644,25 @@ class PaperRows:
 
     @cached_property
     def whitener(self) -> FloatArray:
-        """(g, k - 2, k - 2) multiplies the rows of a group; made at the points as commanded."""
-        return build_whitener(*self.layout.levers, self.sigma, self.weights)
+        """(g, k - 2, k - 2) multiplies the rows of a group, S = sigma^2 1; made at the points as
+        commanded.
+
+        "printed": all rows alike, divided by the root mean square of their sds, so that a prior can
+        be set against them.
+        """
+        d_1, d = self.layout.levers
+        B = map_displacements(d_1, d)
+        unit = np.broadcast_to(np.eye(d.shape[1]), (*d.shape[:2], d.shape[1]))
+        sd = self.sigma * np.linalg.norm(B, axis=2)
+        if self.weights == "printed":
+            return unit / np.sqrt(np.mean(sd**2))
+        if self.weights == "distance":
+            length = np.linalg.norm(d_1, axis=1)[:, None]
+            return unit / (length * np.sqrt(np.mean((sd / length) ** 2)))[..., None]
+        if self.weights == "single":
+            return unit / sd[..., None]
+        covariance = self.sigma**2 * B @ np.swapaxes(B, 1, 2)
+        return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)), dtype=np.float64)
 
     def values(self, deviation: FloatArray) -> FloatArray:
         """Return parameters (t, p) [m] at deviations z (t, p)."""
@@ -719,25 +731,3 @@ def map_displacements(d_1: FloatArray, d: FloatArray) -> FloatArray:
     B[:, :, 1] = d
     B[:, np.arange(r), 2 + np.arange(r)] = d_1[:, None]
     return B.reshape(g, r, -1)
-
-
-def build_whitener(d_1: FloatArray, d: FloatArray, sigma: float, weights: Weights) -> FloatArray:
-    """Return W (g, k - 2, k - 2) for rows of points with noise of `sigma` [m] in x, y and z: S =
-    sigma^2 1.
-
-    "printed": all rows alike, divided by the root mean square of their sds, so that a prior can be
-    set against them.
-    """
-    B = map_displacements(d_1, d)
-    unit = np.broadcast_to(np.eye(d.shape[1]), (*d.shape[:2], d.shape[1]))
-    sd = sigma * np.linalg.norm(B, axis=2)
-    if weights == "printed":
-        return unit / np.sqrt(np.mean(sd**2))
-    if weights == "distance":
-        length = np.linalg.norm(d_1, axis=1)[:, None]
-        return unit / (length * np.sqrt(np.mean((sd / length) ** 2)))[..., None]
-    if weights == "single":
-        return unit / sd[..., None]
-    return np.asarray(
-        np.linalg.inv(np.linalg.cholesky(sigma**2 * B @ np.swapaxes(B, 1, 2))), dtype=np.float64
-    )
