@@ -20,13 +20,13 @@ from loopcal.papers.tsvd_2016 import steps as tsvd
 from loopcal.studies.files.study_file import load_study
 from loopcal.studies.results.study_result import StudyResult
 from loopcal.studies.simulation.block import (
+    OUTCOMES,
     calibrate_cells,
     find_cells,
     list_tasks,
     make_stream,
     set_size,
 )
-from loopcal.studies.simulation.fits import OUTCOMES
 from loopcal.studies.simulation.published_steps import (
     Layout,
     PaperRows,

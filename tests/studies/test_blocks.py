@@ -31,8 +31,13 @@ from loopcal.mechanism.kinematics import forward_trials
 from loopcal.mechanism.solutions import forward, inverse
 from loopcal.mechanism.workspace import sample_workspace
 from loopcal.studies.simulation import block, machines
-from loopcal.studies.simulation.block import compute_block, list_tasks, make_stream, replay_trial
-from loopcal.studies.simulation.fits import OUTCOMES
+from loopcal.studies.simulation.block import (
+    OUTCOMES,
+    compute_block,
+    list_tasks,
+    make_stream,
+    replay_trial,
+)
 from loopcal.studies.simulation.machines import (
     AlteredNoise,
     alter_noise,

@@ -16,6 +16,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from loopcal.errors import FileError
 from loopcal.studies.files.study_file import load_study
 from loopcal.studies.simulation.block import (
+    OUTCOMES,
     calibrate_cells,
     compute_block,
     find_cells,
@@ -25,7 +26,6 @@ from loopcal.studies.simulation.block import (
     set_size,
     simulate_block,
 )
-from loopcal.studies.simulation.fits import OUTCOMES
 from loopcal.studies.simulation.machines import draw_machines, prepare_cell
 from loopcal.studies.simulation.published_steps import identify_per_leg, make_raw_problem
 from loopcal.studies.specification.levels import (

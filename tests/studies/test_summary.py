@@ -42,7 +42,7 @@ from loopcal.studies.results.study_result import (
     summarize_study,
 )
 from loopcal.studies.results.summary_drawing import choose_layout, render_figures
-from loopcal.studies.simulation.fits import OUTCOMES
+from loopcal.studies.simulation.block import OUTCOMES
 from loopcal.studies.specification.levels import MethodLevel, NoiseLevel, PosesLevel, Question
 from loopcal.studies.specification.levels import Scores as ScoreSettings
 from loopcal.studies.specification.study import Cell, Study

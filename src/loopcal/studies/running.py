@@ -36,15 +36,16 @@ from loopcal.studies.files.study_file import load_study
 from loopcal.studies.results.questions import explain_failures
 from loopcal.studies.results.study_result import StudyResult
 from loopcal.studies.simulation.block import (
+    OUTCOMES,
     BlockTask,
     PosesTask,
     compute_block,
     compute_task,
+    fit_per_leg,
     make_block_task,
     make_poses_task,
     replay_trial,
 )
-from loopcal.studies.simulation.fits import OUTCOMES, fit_per_leg
 from loopcal.studies.simulation.machines import CellPoses, compute_poses, is_planned
 from loopcal.studies.specification.levels import FACTORS, PER_LEG
 from loopcal.studies.specification.study import Cell, Study, compute_key, describe_cell

@@ -47,7 +47,7 @@ from loopcal.studies.results.study_result import (
     find_columns,
     iterate_trials,
 )
-from loopcal.studies.simulation.fits import OUTCOMES, STEPS_REMAIN, has_result
+from loopcal.studies.simulation.block import OUTCOMES, STEPS_REMAIN, has_result
 from loopcal.studies.specification.levels import Question, list_chains
 from loopcal.studies.specification.study import Cell, Study, check_question
 from loopcal.units import Unit, find_unit

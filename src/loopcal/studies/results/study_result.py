@@ -26,7 +26,7 @@ from loopcal.studies.files.store import (
     read_store,
     read_study,
 )
-from loopcal.studies.simulation.fits import OUTCOMES, STEPS_REMAIN, has_result
+from loopcal.studies.simulation.block import OUTCOMES, STEPS_REMAIN, has_result
 from loopcal.studies.specification.levels import Question
 from loopcal.studies.specification.study import Cell, ScoreColumn, Study
 from loopcal.typing import FloatArray, Progress, report_no_progress
