@@ -23,7 +23,7 @@ from loopcal.studies.files.store import NAME, StudySource, open_study
 from loopcal.studies.files.study_file import load_study
 from loopcal.studies.running import run_blocks
 from loopcal.studies.simulation.block import compute_block, list_tasks
-from loopcal.studies.specification.study import Study
+from loopcal.studies.specification import Study
 
 NAMES = ("poses", "instruments", "methods")
 BLOCKS = (50, 200, 1000)

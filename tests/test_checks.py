@@ -13,8 +13,7 @@ from loopcal.errors import DataError, EstimationError
 from loopcal.planning.constraints import PlanOptions
 from loopcal.planning.plane_line_planning import SurfaceOptions
 from loopcal.studies.files.study_file import LEVELS
-from loopcal.studies.specification.levels import Question, Scores
-from loopcal.studies.specification.study import Study
+from loopcal.studies.specification import Question, Scores, Study
 
 RECORDS: list[tuple[Any, dict[str, Any]]] = [
     *((record, {}) for record in (PlanOptions, SurfaceOptions, Scores, *LEVELS.values())),

@@ -28,8 +28,7 @@ from loopcal.mechanism.families import FAMILIES
 from loopcal.mechanism.families.limbs import Axis
 from loopcal.mechanism.families.records import RobotRecord
 from loopcal.studies.files.study_file import LEVELS
-from loopcal.studies.specification.levels import Question, Scores
-from loopcal.studies.specification.study import StudySettings, list_columns
+from loopcal.studies.specification import Question, Scores, StudySettings, list_columns
 from loopcal.units import DISPLAY_UNITS, Dimension
 from tools.markdown import fill_blocks, format_table
 

@@ -18,7 +18,7 @@ from loopcal.mechanism.kinematics import forward_trials
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.workspace import sample_workspace
 from loopcal.studies.simulation.machines import AlteredNoise
-from loopcal.studies.specification.levels import EffectsLevel, Outliers
+from loopcal.studies.specification import EffectsLevel, Outliers
 
 Array = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]

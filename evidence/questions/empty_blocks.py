@@ -13,7 +13,7 @@ import numpy as np
 from loopcal.studies.executors import Answer, Executor, R, T
 from loopcal.studies.simulation.block import PosesTask, compute_task
 from loopcal.studies.simulation.machines import CellPoses
-from loopcal.studies.specification.study import COLUMNS
+from loopcal.studies.specification import COLUMNS
 from loopcal.typing import FloatArray
 
 

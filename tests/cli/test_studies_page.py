@@ -11,7 +11,7 @@ import pytest
 
 import loopcal as lc
 from loopcal.cli.entry_point import main
-from loopcal.studies.specification.study import MOST_TRIALS
+from loopcal.studies.specification import MOST_TRIALS
 from tests.cli.page_commands import list_commands
 
 TRIALS = 18

@@ -34,7 +34,7 @@ from loopcal.studies.simulation.published_steps import (
     penalize_ridge,
     penalize_truncated,
 )
-from loopcal.studies.specification.levels import PosesLevel
+from loopcal.studies.specification import PosesLevel
 
 MM = 1e-3
 

@@ -11,15 +11,16 @@ import numpy as np
 from loopcal.io.robot.robot_file import find_robot_file
 from loopcal.studies.files.store import StudySource, load_specification, open_study, read_store
 from loopcal.studies.results.study_result import StudyResult, find_columns
-from loopcal.studies.specification.levels import (
+from loopcal.studies.specification import (
+    Cell,
     InstrumentLevel,
     MethodLevel,
     NoiseLevel,
     PosesLevel,
     Question,
     Robot,
+    Study,
 )
-from loopcal.studies.specification.study import Cell, Study
 
 Scores = dict[str, np.ndarray]
 """Name of a score -> its values (t,)."""

@@ -9,14 +9,14 @@ from typing import Any
 
 from loopcal.io.robot.robot_file import list_shipped_robots
 from loopcal.studies.simulation.block import compute_block, list_tasks
-from loopcal.studies.specification.levels import (
+from loopcal.studies.specification import (
     InstrumentLevel,
     MethodLevel,
     PosesLevel,
     Robot,
     Scores,
+    Study,
 )
-from loopcal.studies.specification.study import Study
 from loopcal.typing import FloatArray
 
 CAMERA = InstrumentLevel(("component",), ("x", "y", "z"), sigma_position=2e-5)

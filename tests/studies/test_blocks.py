@@ -44,7 +44,7 @@ from loopcal.studies.simulation.machines import (
     draw_motion,
     make_disturbance,
 )
-from loopcal.studies.specification.levels import (
+from loopcal.studies.specification import (
     Backlash,
     EffectsLevel,
     ErrorsLevel,

@@ -50,7 +50,7 @@ from loopcal.studies.running import (
 )
 from loopcal.studies.simulation.block import BlockTask, PosesTask, compute_task, list_tasks
 from loopcal.studies.simulation.machines import CellPoses
-from loopcal.studies.specification.levels import (
+from loopcal.studies.specification import (
     EffectsLevel,
     ErrorsLevel,
     InstrumentLevel,

@@ -28,7 +28,7 @@ from loopcal.studies.simulation.block import (
 )
 from loopcal.studies.simulation.machines import draw_machines, prepare_cell
 from loopcal.studies.simulation.published_steps import identify_per_leg, make_raw_problem
-from loopcal.studies.specification.levels import (
+from loopcal.studies.specification import (
     EffectsLevel,
     ErrorsLevel,
     InstrumentLevel,

@@ -16,7 +16,8 @@ from loopcal.results.tables import render_text
 from loopcal.studies.files.store import StudySource, open_study
 from loopcal.studies.results.questions import AnsweredQuestion, decide, say_answer, view_answers
 from loopcal.studies.results.study_result import StudyResult
-from loopcal.studies.specification.levels import (
+from loopcal.studies.specification import (
+    Cell,
     EffectsLevel,
     InstrumentLevel,
     Outliers,
@@ -24,7 +25,6 @@ from loopcal.studies.specification.levels import (
     Question,
     list_chains,
 )
-from loopcal.studies.specification.study import Cell
 from tests.studies.stored_scores import Scores, make_study, store_scores
 
 SHARES = {"10": 0.5, "20": 0.93, "40": 0.999}

@@ -12,7 +12,7 @@ import pytest
 from loopcal.errors import FileError
 from loopcal.studies.files.study_file import load_study
 from loopcal.studies.simulation.block import compute_block, list_tasks
-from loopcal.studies.specification.levels import (
+from loopcal.studies.specification import (
     EffectsLevel,
     ErrorsLevel,
     MethodLevel,
@@ -20,8 +20,8 @@ from loopcal.studies.specification.levels import (
     Outliers,
     PosesLevel,
     Scores,
+    Study,
 )
-from loopcal.studies.specification.study import Study
 from tests.studies.studies import CAMERA, make_study, read_robot
 
 EXAMPLES = sorted((Path(__file__).parents[2] / "examples" / "studies").glob("*.yaml"))

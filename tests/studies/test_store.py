@@ -27,14 +27,15 @@ from loopcal.studies.files.store import (
     open_store,
     read_store,
 )
-from loopcal.studies.specification.levels import (
+from loopcal.studies.specification import (
     ErrorsLevel,
     MethodLevel,
     NoiseLevel,
     PosesLevel,
     Robot,
+    Study,
+    list_conflicts,
 )
-from loopcal.studies.specification.study import Study, list_conflicts
 from tests.findings.expectations import expect_refusal
 
 HEADER = StoreHeader("{}", ("outcome", "position", "rank"), {"numerics": "1"})

@@ -43,9 +43,8 @@ from loopcal.studies.results.study_result import (
 )
 from loopcal.studies.results.summary_drawing import choose_layout, render_figures
 from loopcal.studies.simulation.block import OUTCOMES
-from loopcal.studies.specification.levels import MethodLevel, NoiseLevel, PosesLevel, Question
-from loopcal.studies.specification.levels import Scores as ScoreSettings
-from loopcal.studies.specification.study import Cell, Study
+from loopcal.studies.specification import Cell, MethodLevel, NoiseLevel, PosesLevel, Question, Study
+from loopcal.studies.specification import Scores as ScoreSettings
 from tests.studies.stored_scores import Scores, make_study, store_scores
 
 FAILED, RATE = 1, 0.1

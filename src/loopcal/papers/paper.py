@@ -29,8 +29,7 @@ from loopcal.mechanism.workspace import list_tilt_rings
 if TYPE_CHECKING:
     from loopcal.mechanism.model import Mechanism
     from loopcal.papers.reproduction import Reproduction
-    from loopcal.studies.specification.levels import ErrorsLevel
-    from loopcal.studies.specification.study import Study
+    from loopcal.studies.specification import ErrorsLevel, Study
 
 STUDY = "study.yaml"
 """File of the study of a paper."""

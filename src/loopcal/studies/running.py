@@ -47,8 +47,7 @@ from loopcal.studies.simulation.block import (
     replay_trial,
 )
 from loopcal.studies.simulation.machines import CellPoses, compute_poses, is_planned
-from loopcal.studies.specification.levels import FACTORS, PER_LEG
-from loopcal.studies.specification.study import Cell, Study, compute_key, describe_cell
+from loopcal.studies.specification import FACTORS, PER_LEG, Cell, Study, compute_key, describe_cell
 from loopcal.typing import Progress, report_no_progress
 
 MOST_WAITING = 64

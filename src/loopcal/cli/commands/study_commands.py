@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from loopcal.studies.executors import Executor
     from loopcal.studies.files.store import StudyStore
     from loopcal.studies.running import Share
-    from loopcal.studies.specification.study import Study
+    from loopcal.studies.specification import Study
 
 
 STOPPED, INCOMPLETE = 1, 2

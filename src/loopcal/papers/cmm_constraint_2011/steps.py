@@ -43,8 +43,8 @@ from loopcal.planning.plane_line_planning import (
 from loopcal.studies.simulation.block import CalibratedCell, calibrate_cells, set_size
 from loopcal.studies.simulation.machines import build_robot_of, measure_held_points
 from loopcal.studies.simulation.published_steps import Layout, linearize_products, map_displacements
-from loopcal.studies.specification.levels import FEWEST_POINTS, PosesLevel
-from loopcal.studies.specification.study import Study as GridStudy
+from loopcal.studies.specification import FEWEST_POINTS, PosesLevel
+from loopcal.studies.specification import Study as GridStudy
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
 MM, DEGREE = 1e-3, np.pi / 180.0

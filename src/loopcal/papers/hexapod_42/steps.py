@@ -30,6 +30,7 @@ from loopcal.mechanism.solutions import Solution, forward, inverse
 from loopcal.mechanism.workspace import sample_workspace
 from loopcal.papers.paper import PAPERS, StudyCase
 from loopcal.papers.published import PaperFile, Row
+from loopcal.studies import specification
 from loopcal.studies.simulation.block import CalibratedCell, calibrate_cells, find_cells, set_size
 from loopcal.studies.simulation.published_steps import (
     MM,
@@ -38,8 +39,7 @@ from loopcal.studies.simulation.published_steps import (
     integrate_errors,
     list_raw_units,
 )
-from loopcal.studies.specification import levels
-from loopcal.studies.specification.study import Study
+from loopcal.studies.specification import Study
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import SI_SYMBOLS, Dimension
 
@@ -175,28 +175,32 @@ def make_setup(case: StudyCase | None = None, seed: int = 0) -> Setup:
         )
         if error
     }
-    rule = levels.MethodLevel(levels.PER_LEG, epsilon=epsilon, steps=SIZES.find("iterations"))
+    rule = specification.MethodLevel(
+        specification.PER_LEG, epsilon=epsilon, steps=SIZES.find("iterations")
+    )
     study = replace(
         study,
         instruments={name: make_instrument(*limits) for name, limits in list_noises().items()},
         poses={MEASURED: make_poses_level(coordinates)},
-        errors={"one machine": levels.ErrorsLevel(deviations=deviations)},
+        errors={"one machine": specification.ErrorsLevel(deviations=deviations)},
         methods={**study.methods, PER_LEG: rule},
     )
     truth = robot.with_values(truth)
     return Setup(study, robot, truth, coordinates, epsilon, case.robot is None)
 
 
-def make_poses_level(coordinates: FloatArray) -> levels.PosesLevel:
+def make_poses_level(coordinates: FloatArray) -> specification.PosesLevel:
     """Return the level of a study with these poses (n, c) [m, rad]."""
-    return levels.PosesLevel(len(coordinates), coordinates=tuple(map(tuple, coordinates.tolist())))
+    return specification.PosesLevel(
+        len(coordinates), coordinates=tuple(map(tuple, coordinates.tolist()))
+    )
 
 
-def make_instrument(length: float, angle: float) -> levels.InstrumentLevel:
+def make_instrument(length: float, angle: float) -> specification.InstrumentLevel:
     """Return an instrument with uniform noise within limits [mm] of lengths and [rad] of angles."""
     position, orientation = (float(x / np.sqrt(3.0)) for x in (length * MM, angle))
     kind = (("pose",), (), f"euler-{ORDER}")
-    return levels.InstrumentLevel(*kind, position, orientation, distribution="uniform")
+    return specification.InstrumentLevel(*kind, position, orientation, distribution="uniform")
 
 
 def list_noises() -> dict[str, tuple[float, float]]:

@@ -54,8 +54,7 @@ from loopcal.studies.simulation.published_steps import (
     penalize_truncated,
     take_steps,
 )
-from loopcal.studies.specification.levels import ErrorsLevel
-from loopcal.studies.specification.study import describe_cell
+from loopcal.studies.specification import ErrorsLevel, describe_cell
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension
 

@@ -39,7 +39,7 @@ from loopcal.findings import report_finding
 from loopcal.io.core.limits import YAML_SIZE
 from loopcal.io.core.outputs import replace_folder
 from loopcal.io.core.text_file import lock, open_folder, read_bytes, resolve_links
-from loopcal.studies.specification.study import NUMERICS, Study, list_conflicts
+from loopcal.studies.specification import NUMERICS, Study, list_conflicts
 from loopcal.typing import FloatArray, Progress, report_no_progress
 from loopcal.version import __version__
 

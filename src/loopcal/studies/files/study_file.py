@@ -41,7 +41,8 @@ from loopcal.studies.simulation.machines import (
     resolve_patterns,
 )
 from loopcal.studies.simulation.published_steps import check_legs
-from loopcal.studies.specification.levels import (
+from loopcal.studies.specification import (
+    BLOCK,
     FACTORS,
     PER_LEG,
     EffectsLevel,
@@ -51,8 +52,10 @@ from loopcal.studies.specification.levels import (
     NoiseLevel,
     PosesLevel,
     Robot,
+    Study,
+    StudySettings,
+    check_question,
 )
-from loopcal.studies.specification.study import BLOCK, Study, StudySettings, check_question
 
 LEVELS: Mapping[str, type] = {
     "instruments": InstrumentLevel,

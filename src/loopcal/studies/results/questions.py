@@ -48,8 +48,7 @@ from loopcal.studies.results.study_result import (
     iterate_trials,
 )
 from loopcal.studies.simulation.block import OUTCOMES, STEPS_REMAIN, has_result
-from loopcal.studies.specification.levels import Question, list_chains
-from loopcal.studies.specification.study import Cell, Study, check_question
+from loopcal.studies.specification import Cell, Question, Study, check_question, list_chains
 from loopcal.units import Unit, find_unit
 
 Certainty = Literal["certain", "between", "none", "unknown"]

@@ -27,8 +27,7 @@ from loopcal.studies.files.store import (
     read_study,
 )
 from loopcal.studies.simulation.block import OUTCOMES, STEPS_REMAIN, has_result
-from loopcal.studies.specification.levels import Question
-from loopcal.studies.specification.study import Cell, ScoreColumn, Study
+from loopcal.studies.specification import Cell, Question, ScoreColumn, Study
 from loopcal.typing import FloatArray, Progress, report_no_progress
 
 if TYPE_CHECKING:

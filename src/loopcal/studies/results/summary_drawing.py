@@ -29,8 +29,13 @@ from loopcal.report.pictures import render_figure
 from loopcal.results.tables import choose_unit
 from loopcal.studies.results.questions import FRAMES, UNITS
 from loopcal.studies.results.study_result import CellSummary, Interval, StudySummary, find_columns
-from loopcal.studies.specification.levels import list_chains
-from loopcal.studies.specification.study import BASE_COLUMNS, ScoreColumn, Study, check_question
+from loopcal.studies.specification import (
+    BASE_COLUMNS,
+    ScoreColumn,
+    Study,
+    check_question,
+    list_chains,
+)
 from loopcal.units import Unit
 
 if TYPE_CHECKING:

@@ -70,8 +70,9 @@ from loopcal.studies.simulation.published_steps import (
     penalize_truncated,
     take_steps,
 )
-from loopcal.studies.specification.levels import PER_LEG, MethodLevel
-from loopcal.studies.specification.study import (
+from loopcal.studies.specification import (
+    PER_LEG,
+    MethodLevel,
     Study,
     compute_key,
     describe_cell,
@@ -437,7 +438,7 @@ def compute_block(task: BlockTask, threads: int = 1) -> FloatArray:
     scores: dict[str, Any] = dict.fromkeys(names, np.nan)
     scores |= score_poses(cell, trials, fits, stream) | score_parameters(cell, trials, fits)
     scores |= fits.scores
-    assert set(scores) == set(names), "a score needs its column in studies/specification/study.py"
+    assert set(scores) == set(names), "a score needs its column in studies/specification.py"
     columns = np.broadcast_arrays(*(scores[name] for name in names))
     return np.stack(columns, axis=1)
 

@@ -44,8 +44,9 @@ from loopcal.planning.plane_line_planning import (
 )
 from loopcal.planning.pose_planning import plan
 from loopcal.studies.simulation.published_steps import Layout
-from loopcal.studies.specification.levels import (
+from loopcal.studies.specification import (
     Backlash,
+    CellContent,
     EffectsLevel,
     ErrorsLevel,
     InstrumentLevel,
@@ -53,8 +54,8 @@ from loopcal.studies.specification.levels import (
     NoiseLevel,
     PosesLevel,
     ThermalGrowth,
+    format_json,
 )
-from loopcal.studies.specification.study import CellContent, format_json
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension, parse_quantity
 
