@@ -13,13 +13,15 @@ from typing import Any
 import loopcal
 from loopcal.report.pictures import render_figure
 from loopcal.results.tables import Table
-from loopcal.studies.results.questions import (
+from loopcal.studies.study_result import (
     FRAMES,
     AnsweredQuestion,
+    CellSummary,
+    Interval,
+    StudyResult,
     tabulate_answers,
     tabulate_medians,
 )
-from loopcal.studies.results.study_result import CellSummary, Interval, StudyResult
 
 STUDIES = Path(__file__).resolve().parents[2] / "examples" / "studies"
 

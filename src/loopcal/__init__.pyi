@@ -164,9 +164,9 @@ from .studies.executors import Processes as Processes
 from .studies.executors import Ray as Ray
 from .studies.executors import Serial as Serial
 from .studies.files.study_file import load_study as load_study
-from .studies.results.study_result import StudyResult as StudyResult
 from .studies.running import study as study
 from .studies.specification import Study as Study
+from .studies.study_result import StudyResult as StudyResult
 from .units import Dimension as Dimension
 
 __version__: str

@@ -18,7 +18,6 @@ from loopcal.papers.hexapod_42 import steps as hexapod
 from loopcal.papers.paper import PAPERS
 from loopcal.papers.tsvd_2016 import steps as tsvd
 from loopcal.studies.files.study_file import load_study
-from loopcal.studies.results.study_result import StudyResult
 from loopcal.studies.simulation.block import (
     OUTCOMES,
     calibrate_cells,
@@ -35,6 +34,7 @@ from loopcal.studies.simulation.published_steps import (
     penalize_truncated,
 )
 from loopcal.studies.specification import PosesLevel
+from loopcal.studies.study_result import StudyResult
 
 MM = 1e-3
 

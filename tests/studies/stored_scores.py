@@ -10,7 +10,6 @@ import numpy as np
 
 from loopcal.io.robot.robot_file import find_robot_file
 from loopcal.studies.files.store import StudySource, load_specification, open_study, read_store
-from loopcal.studies.results.study_result import StudyResult, find_columns
 from loopcal.studies.specification import (
     Cell,
     InstrumentLevel,
@@ -21,6 +20,7 @@ from loopcal.studies.specification import (
     Robot,
     Study,
 )
+from loopcal.studies.study_result import StudyResult, find_columns
 
 Scores = dict[str, np.ndarray]
 """Name of a score -> its values (t,)."""

@@ -35,7 +35,6 @@ from loopcal.studies.files.store import (
     open_study,
     read_study,
 )
-from loopcal.studies.results.study_result import StudyResult
 from loopcal.studies.running import (
     MOST_WAITING,
     Share,
@@ -58,6 +57,7 @@ from loopcal.studies.specification import (
     NoiseLevel,
     PosesLevel,
 )
+from loopcal.studies.study_result import StudyResult
 from loopcal.typing import FloatArray
 from tests.findings.expectations import expect_refusal, list_codes
 from tests.studies.small_study import CELLS, write_study

@@ -14,8 +14,6 @@ from scipy.stats import binom
 from loopcal.errors import DataError
 from loopcal.results.tables import render_text
 from loopcal.studies.files.store import StudySource, open_study
-from loopcal.studies.results.questions import AnsweredQuestion, decide, say_answer, view_answers
-from loopcal.studies.results.study_result import StudyResult
 from loopcal.studies.specification import (
     Cell,
     EffectsLevel,
@@ -24,6 +22,13 @@ from loopcal.studies.specification import (
     PosesLevel,
     Question,
     list_chains,
+)
+from loopcal.studies.study_result import (
+    AnsweredQuestion,
+    StudyResult,
+    decide,
+    say_answer,
+    view_answers,
 )
 from tests.studies.stored_scores import Scores, make_study, store_scores
 

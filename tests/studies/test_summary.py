@@ -22,15 +22,11 @@ from loopcal.errors import DataError
 from loopcal.report.pictures import render_figure
 from loopcal.results.tables import render_text
 from loopcal.studies.files.store import read_store
-from loopcal.studies.results.questions import (
+from loopcal.studies.simulation.block import OUTCOMES
+from loopcal.studies.specification import Cell, MethodLevel, NoiseLevel, PosesLevel, Question, Study
+from loopcal.studies.specification import Scores as ScoreSettings
+from loopcal.studies.study_result import (
     FRAMES,
-    list_shown,
-    say_failures,
-    tabulate_medians,
-    view_summary,
-    write_summary,
-)
-from loopcal.studies.results.study_result import (
     MEMORY,
     CellSummary,
     Interval,
@@ -39,12 +35,14 @@ from loopcal.studies.results.study_result import (
     estimate_mean,
     estimate_quantile,
     estimate_share,
+    list_shown,
+    say_failures,
     summarize_study,
+    tabulate_medians,
+    view_summary,
+    write_summary,
 )
-from loopcal.studies.results.summary_drawing import choose_layout, render_figures
-from loopcal.studies.simulation.block import OUTCOMES
-from loopcal.studies.specification import Cell, MethodLevel, NoiseLevel, PosesLevel, Question, Study
-from loopcal.studies.specification import Scores as ScoreSettings
+from loopcal.studies.summary_drawing import choose_layout, render_figures
 from tests.studies.stored_scores import Scores, make_study, store_scores
 
 FAILED, RATE = 1, 0.1
@@ -283,7 +281,7 @@ def test_scores_that_are_read_a_few_at_a_time_have_the_same_summary(
 ) -> None:
     whole = result.summarize()
     monkeypatch.setattr(
-        "loopcal.studies.results.study_result.MEMORY", 8 * 400 * 3
+        "loopcal.studies.study_result.MEMORY", 8 * 400 * 3
     )  # three scores of a cell
     assert result.summarize() == whole
 

@@ -32,7 +32,7 @@ from typing import Any
 import numpy as np
 
 from loopcal.findings.wording import fill_template
-from loopcal.studies.results.study_result import Interval, compute_binomial_interval
+from loopcal.studies.study_result import Interval, compute_binomial_interval
 from loopcal.typing import BoolArray, FloatArray
 
 Cell = str | float | int | bool | None

@@ -33,8 +33,6 @@ from loopcal.results.tables import Block
 from loopcal.studies.executors import MOST_LOSSES, Executor, Processes, Serial
 from loopcal.studies.files.store import StudySource, StudyStore, open_study, read_study
 from loopcal.studies.files.study_file import load_study
-from loopcal.studies.results.questions import explain_failures
-from loopcal.studies.results.study_result import StudyResult
 from loopcal.studies.simulation.block import (
     OUTCOMES,
     BlockTask,
@@ -48,6 +46,7 @@ from loopcal.studies.simulation.block import (
 )
 from loopcal.studies.simulation.machines import CellPoses, compute_poses, is_planned
 from loopcal.studies.specification import FACTORS, PER_LEG, Cell, Study, compute_key, describe_cell
+from loopcal.studies.study_result import StudyResult, explain_failures
 from loopcal.typing import Progress, report_no_progress
 
 MOST_WAITING = 64

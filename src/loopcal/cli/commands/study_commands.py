@@ -247,7 +247,7 @@ def status(folder: Path = FOLDER) -> Output:
     Examples:
       loopcal study status results
     """
-    from loopcal.studies.results.study_result import read_status, view_status
+    from loopcal.studies.study_result import read_status, view_status
 
     state = read_status(folder)
     return Output(state, lambda: view_status(state, round_duration))
@@ -274,21 +274,20 @@ def summary(
       loopcal study summary results --score position_max --score condition
       loopcal study summary results --score position --against instrument
     """
-    from loopcal.studies.results import questions
-    from loopcal.studies.results.study_result import StudyResult
-    from loopcal.studies.results.summary_drawing import render_figures
+    from loopcal.studies import study_result
+    from loopcal.studies.summary_drawing import render_figures
 
-    result = StudyResult(folder)
+    result = study_result.StudyResult(folder)
     with terminal.TerminalProgress("summarizing trials"):
         summarized, answered = result.summarize(), result.answer_questions()
-        shown = questions.list_shown(result.study, summarized, scores)
-        page = questions.view_summary(result.study, summarized, shown)
+        shown = study_result.list_shown(result.study, summarized, scores)
+        page = study_result.view_summary(result.study, summarized, shown)
         figures = render_figures(result.study, summarized, shown, against)
-        questions.write_summary(folder, result.study, summarized, answered, figures)
+        study_result.write_summary(folder, result.study, summarized, answered, figures)
     written = f"Written to {folder}: {', '.join(('summary.json', 'summary.csv', *figures))}"
     return Output(
-        questions.build_document(summarized, answered),
-        lambda: [*page, "", *questions.view_answers(answered), written],
+        study_result.build_document(summarized, answered),
+        lambda: [*page, "", *study_result.view_answers(answered), written],
     )
 
 
@@ -318,8 +317,7 @@ def ask(
       loopcal study ask results --smallest poses --limit 10um
       loopcal study ask results --largest noise --score position_max --limit 0.05mm --share 0.9
     """
-    from loopcal.studies.results.questions import view_answers
-    from loopcal.studies.results.study_result import StudyResult
+    from loopcal.studies.study_result import StudyResult, view_answers
 
     if (smallest is None) == (largest is None):
         raise click.UsageError("give --smallest FACTOR or --largest FACTOR, one of them")
@@ -346,7 +344,7 @@ def export(
     """
     from loopcal.io.core.outputs import refuse_outputs
     from loopcal.studies.files.store import load_specification, read_store
-    from loopcal.studies.results.study_result import export_trials
+    from loopcal.studies.study_result import export_trials
 
     refuse_outputs((output,), (), force)
     with read_store(folder) as store, terminal.TerminalProgress() as progress:
@@ -368,7 +366,7 @@ def merge(
       loopcal study merge part-1 part-2 part-3 -o results
     """
     from loopcal.studies.files.store import merge_studies
-    from loopcal.studies.results.study_result import read_status, view_status
+    from loopcal.studies.study_result import read_status, view_status
 
     with terminal.TerminalProgress() as progress:
         count = merge_studies(part_folders, output, progress)

@@ -39,7 +39,13 @@ from loopcal.studies.simulation.published_steps import (
     integrate_errors,
     list_raw_units,
 )
-from loopcal.studies.specification import Study
+from loopcal.studies.specification import (
+    ErrorsLevel,
+    InstrumentLevel,
+    MethodLevel,
+    PosesLevel,
+    Study,
+)
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import SI_SYMBOLS, Dimension
 
@@ -175,32 +181,28 @@ def make_setup(case: StudyCase | None = None, seed: int = 0) -> Setup:
         )
         if error
     }
-    rule = specification.MethodLevel(
-        specification.PER_LEG, epsilon=epsilon, steps=SIZES.find("iterations")
-    )
+    rule = MethodLevel(specification.PER_LEG, epsilon=epsilon, steps=SIZES.find("iterations"))
     study = replace(
         study,
         instruments={name: make_instrument(*limits) for name, limits in list_noises().items()},
         poses={MEASURED: make_poses_level(coordinates)},
-        errors={"one machine": specification.ErrorsLevel(deviations=deviations)},
+        errors={"one machine": ErrorsLevel(deviations=deviations)},
         methods={**study.methods, PER_LEG: rule},
     )
     truth = robot.with_values(truth)
     return Setup(study, robot, truth, coordinates, epsilon, case.robot is None)
 
 
-def make_poses_level(coordinates: FloatArray) -> specification.PosesLevel:
+def make_poses_level(coordinates: FloatArray) -> PosesLevel:
     """Return the level of a study with these poses (n, c) [m, rad]."""
-    return specification.PosesLevel(
-        len(coordinates), coordinates=tuple(map(tuple, coordinates.tolist()))
-    )
+    return PosesLevel(len(coordinates), coordinates=tuple(map(tuple, coordinates.tolist())))
 
 
-def make_instrument(length: float, angle: float) -> specification.InstrumentLevel:
+def make_instrument(length: float, angle: float) -> InstrumentLevel:
     """Return an instrument with uniform noise within limits [mm] of lengths and [rad] of angles."""
     position, orientation = (float(x / np.sqrt(3.0)) for x in (length * MM, angle))
     kind = (("pose",), (), f"euler-{ORDER}")
-    return specification.InstrumentLevel(*kind, position, orientation, distribution="uniform")
+    return InstrumentLevel(*kind, position, orientation, distribution="uniform")
 
 
 def list_noises() -> dict[str, tuple[float, float]]:

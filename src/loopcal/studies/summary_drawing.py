@@ -27,14 +27,20 @@ from loopcal.report.figures.style import (
 )
 from loopcal.report.pictures import render_figure
 from loopcal.results.tables import choose_unit
-from loopcal.studies.results.questions import FRAMES, UNITS
-from loopcal.studies.results.study_result import CellSummary, Interval, StudySummary, find_columns
 from loopcal.studies.specification import (
     BASE_COLUMNS,
     ScoreColumn,
     Study,
     check_question,
     list_chains,
+)
+from loopcal.studies.study_result import (
+    FRAMES,
+    UNITS,
+    CellSummary,
+    Interval,
+    StudySummary,
+    find_columns,
 )
 from loopcal.units import Unit
 
