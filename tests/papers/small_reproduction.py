@@ -3,8 +3,17 @@
 
 import numpy as np
 
-from loopcal.papers.published import OWN_CHECK, Comparison, Figure, Printed, Series, Table, Verdict
-from loopcal.papers.reproduction import Content, Reproduction
+from loopcal.papers.published import (
+    OWN_CHECK,
+    Comparison,
+    Content,
+    Figure,
+    Printed,
+    Reproduction,
+    Series,
+    Table,
+    Verdict,
+)
 
 MADE_BY = {"command": ["loopcal", "reproduce", "small"], "versions": {"loopcal": "1", "numpy": "2"}}
 

@@ -48,7 +48,7 @@ from loopcal.papers.cmm_constraint_2011.steps import (
     name_measure,
 )
 from loopcal.papers.paper import PAPERS
-from loopcal.papers.reproduction import write_page
+from loopcal.papers.published import write_page
 from loopcal.studies.simulation.published_steps import (
     PaperRows,
     identify_from_rows,

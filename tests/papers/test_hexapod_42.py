@@ -29,8 +29,7 @@ from loopcal.papers.hexapod_42.results import (
     make_tables,
 )
 from loopcal.papers.paper import PAPERS
-from loopcal.papers.published import PaperFile
-from loopcal.papers.reproduction import write_page
+from loopcal.papers.published import PaperFile, write_page
 from loopcal.studies.simulation.published_steps import LegForm
 from tests.papers.random_results import collect_answers
 from tests.papers.small_reproduction import MADE_BY

@@ -13,8 +13,17 @@ from loopcal.cli.entry_point import main
 from loopcal.errors import DataError, FileError
 from loopcal.io.core.text_file import to_json
 from loopcal.papers.paper import PAPERS, Paper, find_paper
-from loopcal.papers.published import Figure, PaperText, Series, Verdict, decide
-from loopcal.papers.reproduction import choose_styles, draw, write_folder, write_page
+from loopcal.papers.published import (
+    Figure,
+    PaperText,
+    Series,
+    Verdict,
+    choose_styles,
+    decide,
+    draw,
+    write_folder,
+    write_page,
+)
 from tests.papers.small_reproduction import MADE_BY, build_reproduction
 
 ROOT = Path(__file__).parents[2]

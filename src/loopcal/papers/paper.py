@@ -28,7 +28,7 @@ from loopcal.mechanism.workspace import list_tilt_rings
 
 if TYPE_CHECKING:
     from loopcal.mechanism.model import Mechanism
-    from loopcal.papers.reproduction import Reproduction
+    from loopcal.papers.published import Reproduction
     from loopcal.studies.specification import ErrorsLevel, Study
 
 STUDY = "study.yaml"
@@ -109,8 +109,7 @@ class Paper:
         self, results: Any, seed: int, trials: int, case: StudyCase | None = None
     ) -> Reproduction:
         """Return computed results as tables, verdicts and figures; case : that they belong to."""
-        from loopcal.papers.published import PaperText
-        from loopcal.papers.reproduction import Content, Reproduction
+        from loopcal.papers.published import Content, PaperText, Reproduction
 
         module, case = import_module(f"{self.package}.results"), case or StudyCase(self)
         parts = (

@@ -15,8 +15,8 @@ from loopcal.cli import terminal
 from loopcal.cli.terminal import Output
 
 if TYPE_CHECKING:
+    from loopcal.papers.published import Reproduction
     from loopcal.papers.published import Table as PaperTable
-    from loopcal.papers.reproduction import Reproduction
     from loopcal.results.tables import Block, Table
     from loopcal.studies.simulation.published_steps import PerLegEstimate
 
@@ -67,7 +67,7 @@ def reproduce(
         return Output({"papers": rows}, lambda: lines)
     from loopcal.io.core.outputs import refuse_folder
     from loopcal.io.runs.run_folder import collect_provenance
-    from loopcal.papers.reproduction import FOLDER, build_document, write_folder
+    from loopcal.papers.published import FOLDER, build_document, write_folder
 
     chosen = find_paper(paper)
     if output is not None:
