@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from loopcal.papers.cmm_constraint_2011 import steps
-from loopcal.papers.cmm_constraint_2011.steps import (
+from loopcal.papers.cmm_constraint_2011 import results as steps
+from loopcal.papers.cmm_constraint_2011.results import (
     ABSOLUTE,
     ALIGNED,
     AT_NOMINAL,

@@ -15,8 +15,8 @@ import loopcal as lc
 from loopcal import geometry
 from loopcal.mechanism.solutions import forward, inverse
 from loopcal.numerics.statistics import compute_chi_square_quantile, compute_f_tail
-from loopcal.papers.hexapod_42 import steps
-from loopcal.papers.hexapod_42.steps import (
+from loopcal.papers.hexapod_42 import results as steps
+from loopcal.papers.hexapod_42.results import (
     MM,
     ODD_POSE,
     PARAMETERS,

@@ -436,7 +436,7 @@ def test_published_hexapod_table_is_refused_in_its_printed_euler_order() -> None
     order.
     """
     from loopcal.measure.observations import Observations
-    from loopcal.papers.hexapod_42 import steps
+    from loopcal.papers.hexapod_42 import results as steps
 
     setup, printed = steps.make_setup(), steps.PRINTED.table("table_4", "PP")
     robot, values = setup.robot, printed.values / steps.TO_PRINTED

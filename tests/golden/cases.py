@@ -417,7 +417,7 @@ add("plans/3-prs/I", plan, TRIPOD, "pose", 10, "I")
 
 def run_hexapod_42(noise: tuple[float, float] | None) -> Report:
     """Run steps of the study of 42 parameters; noise: limits [mm, rad], None for exact poses."""
-    from loopcal.papers.hexapod_42 import steps
+    from loopcal.papers.hexapod_42 import results as steps
 
     setup = steps.make_setup()
     measured = setup.actual if noise is None else steps.draw_measured_poses(setup, noise, 0)
@@ -454,7 +454,7 @@ add("papers/tsvd-2016/3-PRS", run_tsvd_2016, "3-PRS", five=False)
 
 def run_cmm_constraint_2011() -> Report:
     """Plan points, draw machines, and calibrate them from planes and lines in the paper's form."""
-    from loopcal.papers.cmm_constraint_2011 import steps
+    from loopcal.papers.cmm_constraint_2011 import results as steps
 
     grid = steps.load_grid(steps.CASE, 0, 3)
     (level,) = grid.poses.values()

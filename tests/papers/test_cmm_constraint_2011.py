@@ -25,16 +25,8 @@ from loopcal.measure.simulation import sample_truth
 from loopcal.mechanism.kinematics import forward_trials
 from loopcal.mechanism.solutions import forward
 from loopcal.papers import published
-from loopcal.papers.cmm_constraint_2011 import steps
+from loopcal.papers.cmm_constraint_2011 import results as steps
 from loopcal.papers.cmm_constraint_2011.results import (
-    Results,
-    compute,
-    judge_claims,
-    list_methods,
-    make_tables,
-    word_change,
-)
-from loopcal.papers.cmm_constraint_2011.steps import (
     ABSOLUTE,
     ALIGNED,
     AT_NOMINAL,
@@ -45,7 +37,13 @@ from loopcal.papers.cmm_constraint_2011.steps import (
     MM,
     PARAMETERS,
     PRIOR,
+    Results,
+    compute,
+    judge_claims,
+    list_methods,
+    make_tables,
     name_measure,
+    word_change,
 )
 from loopcal.papers.paper import PAPERS
 from loopcal.papers.published import write_page

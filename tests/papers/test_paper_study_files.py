@@ -13,8 +13,8 @@ from numpy.testing import assert_allclose
 from loopcal.cli.entry_point import main
 from loopcal.estimate.penalties import MAP, LeastSquares
 from loopcal.measure.instrument import make_random_stream
-from loopcal.papers.cmm_constraint_2011 import steps as cmm
-from loopcal.papers.hexapod_42 import steps as hexapod
+from loopcal.papers.cmm_constraint_2011 import results as cmm
+from loopcal.papers.hexapod_42 import results as hexapod
 from loopcal.papers.paper import PAPERS
 from loopcal.papers.tsvd_2016 import steps as tsvd
 from loopcal.studies.files.study_file import load_study

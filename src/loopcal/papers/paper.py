@@ -3,10 +3,10 @@
 
 A further paper is one more folder and its entry in PAPERS. The folder has `published.yaml` (the
 printed numbers and statements, with their place), `sizes.yaml` (sizes that are ours), `text.yaml`
-(claims, captions, sentences), `study.yaml` (its simulation as a study file), `steps.py` (what the
-paper does), and `results.py` with compute(seed, trials, progress, case) -> results, of which
-compare_tables, make_tables, judge_claims, make_figures and list_replaced (sizes that another robot
-replaces) yield what a page shows.
+(claims, captions, sentences), `study.yaml` (its simulation as a study file), and `results.py` with
+what the paper does and compute(seed, trials, progress, case) -> results, of which compare_tables,
+make_tables, judge_claims, make_figures and list_replaced (sizes that another robot replaces) yield
+what a page shows.
 """
 
 from __future__ import annotations
