@@ -121,7 +121,7 @@ def collect() -> dict:
                 "columns": [
                     "clean data sets",
                     "false alarms [%]",
-                    "stated level [%]",
+                    "nominal level [%]",
                     "mean leverage of a row",
                 ],
                 "formats": ["d", ".1f", ".1f", ".2f"],

@@ -64,7 +64,7 @@ CASES = (
     Case("delta, least squares", "linear-delta", "component", 20, LeastSquares()),
     Case("delta, MAP", "linear-delta", "component", 20, MAP()),
     Case(
-        "hexapod, noise twice as large as stated",
+        "hexapod, noise twice its sigma",
         "hexapod-42",
         "pose",
         20,

@@ -180,14 +180,14 @@ def collect() -> dict[str, Any]:
             "stated",
             "fits",
             "pose errors in U(95 %) [%]",
-            "stated position error, rms [um]",
+            "reported position error, rms [um]",
             "true [um]",
         ],
         "formats": ["", ".0f", "", "d", ".1f", ".1f", ".1f"],
         "rows": rows,
     }
     sessions = {
-        "columns": ["true", "stated `scope`", *table["columns"][3:]],
+        "columns": ["true", "declared `scope`", *table["columns"][3:]],
         "formats": ["", "", *table["formats"][3:]],
         "rows": evaluate_sessions(FITS),
     }

@@ -399,7 +399,7 @@ def _coverage_rows() -> list[list[object]]:
             part.mean() if part.size else None
             for part in (result.directions, result.parameters, result.setup)
         ]
-        suffix = ", noise twice as large as stated" if noise is DoubledNoise else ""
+        suffix = ", noise twice its sigma" if noise is DoubledNoise else ""
         rows.append(
             [
                 case.robot,

@@ -176,8 +176,8 @@ def test_settings_of_every_simple_type_are_written_and_read(registered, tmp_path
         assert type(read) is type(value)
         assert np.array_equal(read, value), key
     for key, wrong, fact in (
-        ("flag", "7", "the number 7, but true or false is needed"),
-        ("count", "2.5", "the number 2.5, but a whole number is needed"),
+        ("flag", "7", "the number 7, but must be true or false"),
+        ("count", "2.5", "the number 2.5, but must be a whole number"),
         ("steps", "[3]", "'3' has no unit"),
         ("shown", "left", "left.* Allowed: 'near', 'far'"),
     ):
@@ -189,7 +189,7 @@ def test_settings_of_every_simple_type_are_written_and_read(registered, tmp_path
 def test_what_is_no_kind_and_no_loss_cannot_be_registered(registered) -> None:
     with pytest.raises(DataError, match="extends Kind"):
         lc.register_kind(int)
-    with pytest.raises(DataError, match="no function 'weight"):
+    with pytest.raises(DataError, match="lacks the function 'weight"):
         lc.register_loss(int)
     with pytest.raises(DataError, match="'huber' is the name of a loss of loopcal"):
         lc.register_loss(lc.Huber)

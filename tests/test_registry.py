@@ -96,7 +96,7 @@ def test_entry_points_of_other_packages_are_found_and_faulty_ones_refused(offer)
     registry: Registry[Any] = Registry("thing", "things", {"pi": "math:pi"})
     assert list(registry) == ["pi", "e", "gone"]
     assert 2.7 < registry["e"] < 2.8
-    with pytest.raises(DataError, match="the thing 'gone' of no_such_package:x cannot be"):
+    with pytest.raises(DataError, match="cannot load the thing 'gone' of no_such_package:x"):
         registry["gone"]
 
 
@@ -161,8 +161,8 @@ def test_settings_may_stand_beside_the_name_of_their_method() -> None:
         ({"method": {"name": "ridge", "lam": {"name": "gcw"}}}, "not a rule"),
         ({"lost": "huber"}, "not an option of a fit .*'loss'"),
         ({"control": {"steps": 3}}, "'steps' is no limit of the steps"),
-        (lc.FitOptions(loss=Unnamed()).to_dict(), r"Unnamed\(\) has no name"),
-        (lc.FitOptions(lc.Ridge(lambda d: np.ones(1))).to_dict(), "has no name"),
+        (lc.FitOptions(loss=Unnamed()).to_dict(), r"Unnamed\(\) has no registered name"),
+        (lc.FitOptions(lc.Ridge(lambda d: np.ones(1))).to_dict(), "has no registered name"),
     ],
 )
 def test_plain_options_that_do_not_fit_are_refused(plain, sentence) -> None:

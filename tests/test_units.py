@@ -34,7 +34,7 @@ def test_quantity_is_its_number_times_the_factor_of_its_unit(text: str, value: f
     [
         ("5", "has no unit. Add one of m, mm"),
         ("mm", "not a number with a unit"),
-        ("5 deg", "unit of angle, but a length is needed"),
+        ("5 deg", "unit of angle, not of a length"),
         ("5 mmm", "unknown unit 'mmm' .did you mean 'mm'"),
         ("nan mm", "not finite"),
         ("", "not a number with a unit"),

@@ -24,7 +24,8 @@ from tools.machine import describe_machine
 from tools.markdown import fill_blocks, format_table
 
 ROOT = Path(__file__).resolve().parent.parent
-BLOCK = r"evidence: (?P<name>[\w-]+)\.(?P<table>[\w-]+)"
+BLOCK = r"evidence: (?P<name>[\w-]+)\.(?P<table>[\w-]+)(?:, (?P<column>[^=>]+) = (?P<value>[^>]+))?"
+"""A table of an evidence file, or its rows with this value in this column."""
 
 
 class EvidenceError(Exception):
@@ -174,7 +175,11 @@ def fill_tables(text: str, folder: Path) -> str:
             raise EvidenceError(
                 f"{path} has no table {match['table']!r}; there are {', '.join(tables) or 'none'}"
             )
-        return render_table(tables[match["table"]])
+        table = tables[match["table"]]
+        if match["column"]:
+            at = table["columns"].index(match["column"])
+            table = {**table, "rows": [r for r in table["rows"] if r[at] == match["value"]]}
+        return render_table(table)
 
     return fill_blocks(text, BLOCK, write)
 

@@ -71,7 +71,7 @@ def format_record(record: type, without: Iterable[str] = ()) -> str:
     keys = [key for key in file_reference.list_keys(record) if key.name not in excluded]
     if not any(key.meaning for key in keys):
         phrases = (f"`{k.name}`: {_hold(k)}" + f" ({k.default})" * bool(k.default) for k in keys)
-        return "; ".join(phrases) + "\n"
+        return "".join(f"- {phrase}\n" for phrase in phrases)
     rows = [(f"`{k.name}`", _hold(k), k.default, k.meaning) for k in keys]
     return format_table(("key", "holds", "default", "meaning"), rows)
 
@@ -125,7 +125,7 @@ def format_kinds() -> str:
         examples = dict.fromkeys(_describe_example(example) for example in kind.examples())
         parts = [f"### `kind: {name}`\n\n{summarize(kind)}\n"]
         if any(map(any, examples)):
-            parts += [format_table(("settings", "columns", "noise is stated for"), examples)]
+            parts += [format_table(("settings", "columns", "noise of"), examples)]
         shared = [f"`{key}`" for key, words in meanings[name].items() if (key, words) in common]
         if shared:
             parts += [f"Common settings: {', '.join(shared)}.\n"]

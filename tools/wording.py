@@ -64,6 +64,9 @@ PATTERNS: Mapping[str, re.Pattern[str]] = {
 }
 
 SENTENCE_END = re.compile(r"(?<=[.!?:])[\"')*_]*\s+(?=[\"'(*_`]*[A-Z\d{])")
+CODE = re.compile(r"\s*(Examples:|bash |CREATE|BEGIN|SELECT|DELETE|FROM blocks|typeof)")
+"""Begin of a text that is commands or SQL."""
+
 ABBREVIATION = re.compile(r"\b(e\.g|i\.e|vs|cf|Eq|Fig|No|et al|approx)\.")
 
 
@@ -204,7 +207,8 @@ def list_strings(tree: ast.Module) -> Iterator[tuple[int, str]]:
             continue
         if id(node) not in skipped and text.count(" ") >= 2:
             for paragraph in re.split(r"\n\s*\n", text):
-                yield node.lineno, " ".join(paragraph.split())
+                if not CODE.match(paragraph):
+                    yield node.lineno, " ".join(paragraph.split())
 
 
 def split_sentences(text: str) -> list[str]:

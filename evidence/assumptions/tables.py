@@ -80,7 +80,7 @@ def tabulate_alarms(statistics: dict[str, Any]) -> dict[str, Any]:
         rates = [_percent(statistics[name]["groups"].get(group, 0.0)) for name in clean]
         rows.append([group, _percent(STATED_LEVELS.get(group)), *rates])
     return {
-        "columns": ["finding", "stated level [%]", *(f"{name} [% of fits]" for name in clean)],
+        "columns": ["finding", "nominal level [%]", *(f"{name} [% of fits]" for name in clean)],
         "formats": ["", "g", *[".2f"] * len(clean)],
         "rows": rows,
     }

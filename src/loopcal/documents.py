@@ -247,8 +247,8 @@ def check_browser(output: Path) -> str:
     browser = find_browser()
     if browser is None:
         raise FileError(
-            "a PDF file needs Chromium or Google Chrome, and neither is installed. Install one, or "
-            "open the HTML file in a browser and print it",
+            "a PDF file needs Chromium or Google Chrome, and this computer has neither. Install "
+            "one, or open the HTML file in a browser and print it",
             output,
         )
     return browser

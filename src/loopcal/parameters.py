@@ -164,7 +164,7 @@ def match_names(names: Sequence[str], pattern: str) -> list[str]:
     fitting = [name for name in names if fnmatchcase(name, pattern)]
     if not fitting:
         raise DataError(
-            f"no parameter is named {pattern!r}{suggest_names(pattern, names)}. Correct the name; "
-            "a pattern such as 'leg*.length' names several"
+            f"no parameter has the name {pattern!r}{suggest_names(pattern, names)}. Correct the "
+            "name: a pattern such as 'leg*.length' names several"
         )
     return fitting

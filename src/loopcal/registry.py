@@ -93,7 +93,7 @@ class Registry(Mapping[str, T]):
             return self._offered[name].load()
         except (ImportError, AttributeError) as error:
             place = f"the {self.noun} {name!r} of {self._offered[name].value}"
-            raise DataError(f"{place} cannot be loaded: {error}") from error
+            raise DataError(f"cannot load {place}: {error}") from error
 
     def __iter__(self) -> Iterator[str]:
         return iter(dict.fromkeys((*self._places, *self._registered, *sorted(self._offered))))

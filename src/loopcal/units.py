@@ -197,7 +197,7 @@ def find_unit(symbol: str, dimension: Dimension | None = None) -> Unit:
     if dimension is not None and known.dimension is not dimension:
         needed = ARTICLES.get(dimension, f"a {dimension.value}")
         raise UnitError(
-            f"{symbol!r} is a unit of {known.dimension.value}, but {needed} is needed. "
+            f"{symbol!r} is a unit of {known.dimension.value}, not of {needed}. "
             f"Allowed: {', '.join(allowed)}"
         )
     return known

@@ -413,5 +413,5 @@ def test_python_users_are_told_where_the_rows_belong():
     for kind in (lc.Plane, lc.Sphere, lc.Separation):
         with pytest.raises(DataError, match="of: base"):
             kind(of="base")
-    with pytest.raises(DataError, match="neither stated nor unknown"):
+    with pytest.raises(DataError, match="neither given nor unknown"):
         lc.Position(targets=NAMES, of="base", unknown=("frame",))

@@ -138,7 +138,7 @@ def test_poses_can_be_held_out_by_name(data):
     assert split.fitted.n_poses == data.n_poses - 2
     with pytest.raises(DataError, match="held_out names the pose '99'"):
         split_data(data, held_out=("99",))
-    with pytest.raises(DataError, match="all poses of the data are held out"):
+    with pytest.raises(DataError, match="validation takes all poses of the data"):
         split_data(data, held_out=data.labels)
 
 
@@ -170,7 +170,7 @@ def test_missed_limit_is_a_statement_beside_the_verdict(robot, data):
     assert report.verdict is Verdict.RESERVATIONS
     assert report.exit_code == 2
     assert [f.code for f in report.failures] == ["conformity.fails"]
-    assert report.headline.endswith("The limit of position is not met.")
+    assert report.headline.endswith("The limit of position fails.")
     assert report.recommendation.code == "values.apply"
     assert report.next_step.code == "workflow.next-improve-accuracy"
 

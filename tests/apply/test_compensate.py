@@ -134,7 +134,7 @@ def test_invalid_compensation_arguments_are_refused():
         compensate(robot, [[0.7, 0, 0]], "poses")  # pyright: ignore[reportArgumentType]
     with pytest.raises(DataError, match="steps is 0, but must be 1 or more"):
         compensate(robot, [[0.7, 0, 0]], "commands", steps=0)
-    with pytest.raises(DataError, match="a target of shape"):
+    with pytest.raises(DataError, match="a target has the shape"):
         compensate(robot, [[0.7, 0.0]])
     with pytest.raises(DataError, match="0 labels for 0 targets: give at least one target"):
         compensate(robot, np.zeros((0, 3)))

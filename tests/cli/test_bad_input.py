@@ -55,11 +55,11 @@ ROBOT_CASES = [
     ("length: mm", "length: deg", "'units.length' is 'deg'. Allowed: 'm', 'mm'"),
     ("stroke:", "strok:", "unknown key 'strok' (did you mean 'stroke'?)"),
     (UNITS, UNITS * 2, "duplicate key 'units'. Remove one"),
-    (BASE, "[120, '-140', 0]", "is the text '-140', but a number is needed"),
-    (BASE, "[120, -140]", "has 2 values, but 3 are needed. Add the missing ones"),
+    (BASE, "[120, '-140', 0]", "is the text '-140', but must be a number"),
+    (BASE, "[120, -140]", "has 2 values, but must have 3. Add the missing ones"),
     (BASE, "[120, .nan, 0]", "is nan. Write a finite number"),
     ("lengths: 233.238076", "lengths: 233,238", "Write a decimal point, not a comma"),
-    ("[-75, 75]", "[-75, 75, 3]", "'stroke' has 3 values, but 2 are needed. Remove the others"),
+    ("[-75, 75]", "[-75, 75, 3]", "'stroke' has 3 values, but must have 2. Remove the others"),
     (BASE, "[120, -140, 0", "not valid YAML"),
     ("format: 1", "format: 2", "has format 2, but this loopcal reads formats up to 1"),
     ("family: gough", "family: gouhg", "is not a family of robots (did you mean 'gough'?)"),
@@ -119,7 +119,7 @@ def test_home_pose_outside_the_strokes_gives_a_warning(loopcal, tmp_path) -> Non
 FILE_CASES = [
     (b"", "is empty"),
     (b" \n\n", "is empty"),
-    (None, "is a folder, but a"),
+    (None, "is a folder, not a"),
     ("# Länge\n".encode("latin-1"), "is not UTF-8 text (byte 0xe4). Save it as UTF-8"),
     (b"format: 1\0\n", "contains a zero byte"),
 ]
@@ -148,14 +148,14 @@ DATA_CASES = [
     ("# noise", "# nois", "data.csv:3: unknown key 'nois' (did you mean 'noise'?)"),
     ("# noise", "# kind: pose\n# noise", "data.csv:3: duplicate key 'kind'"),
     ("q2 [mm]", "q1 [mm]", "data.csv:4: duplicate column 'q1'"),
-    ("b,1,", "b,one,", "data.csv:6: column 'q1' is 'one', but a number is needed"),
+    ("b,1,", "b,one,", "data.csv:6: column 'q1' is 'one', but must be a number"),
     ("b,1,", "b,", "data.csv:6: this row has 7 cells, but the header has 8 columns"),
     ("201.1", "NaN", "data.csv:6: column 'z' is 'NaN', which is not finite"),
     ("b,1,", "b,80,", "data.csv:6): q1 reads 80 mm, 5 mm outside its stroke of -75 to 75 mm"),
     ("# noise: {z: 1 um}\n", "", "'z' has no noise"),
     ("1 um", "1", "'1' has no unit. Add one of m, mm"),
     ("201.1", "201,1", "data.csv:6: this row has 9 cells"),
-    ("# noise", "# controller: no.yaml\n# noise", "data.csv:3: a controller is named, but"),
+    ("# noise", "# controller: no.yaml\n# noise", "data.csv:3: 'controller' needs commanded"),
 ]
 
 
@@ -341,7 +341,7 @@ def test_data_of_another_robot_give_a_note(tmp_path, capsys, stated, noted) -> N
         ),
         (
             "calibrate r.yaml d.csv -o run --hold-out 10",
-            "Write 0.1 for 10 %, or the number of poses to hold out divided by that of all poses.",
+            "Write 0.1 for 10 %, or the number of poses to hold out divided by the number of all",
             "see loopcal calibrate --help",
         ),
         (

@@ -331,7 +331,7 @@ def test_simulate_skips_and_names_unreachable_poses(loopcal, tmp_path) -> None:
     loopcal(words, code=1)  # without the option the pose is refused
     loopcal(
         f"{words} --skip-unreachable",
-        "1 of 3 poses are outside its reach or strokes and are skipped: far",
+        "1 of 3 poses are outside its reach or strokes, so loopcal skips them: far",
     )
     data = lc.load_measurements(tmp_path / "d.csv", lc.load_robot("linear-delta"))
     assert data.labels == ("a", "b")

@@ -215,8 +215,8 @@ def test_page_shows_the_comparison_without_programs_and_requests(loopcal, monkey
     assert read_policy(text).startswith("default-src 'none'; style-src 'sha256-")
     loopcal("may plain -o methods.html")
     text = Path("methods.html").read_text("utf-8")
-    assert "Whether a machine has changed was not tested." in text
-    assert "so loopcal tested no shift" in text
+    assert "There is no test of a change." in text
+    assert "needs independent runs" in text
     assert "4 common poses" in text
 
 

@@ -65,7 +65,7 @@ def test_towers_in_another_frame_are_named(loopcal) -> None:
     ("rows", "message"),
     [
         (("name: radios, value: 1, unit: mm",), "'radios' is not a parameter"),
-        (("name: radius, value: 1, unit: deg",), "'deg' is a unit of angle, but"),
+        (("name: radius, value: 1, unit: deg",), "'deg' is a unit of angle, not"),
         (("name: radius, value: 105, unit: mm",) * 2, "duplicate parameter 'radius'"),
     ],
 )

@@ -106,7 +106,7 @@ def test_target_outside_the_limits_gives_exit_code_2_and_no_reading(
         (TARGETS.replace("roll [deg]", "roll"), "targets.csv:1: column 'roll' has no unit"),
         (
             TARGETS.replace("z [mm]", "z [deg]"),
-            "targets.csv:1: column 'z': 'deg' is a unit of angle, but a length is needed",
+            "targets.csv:1: column 'z': 'deg' is a unit of angle, not of a length",
         ),
         (TARGETS.replace("yaw", "jaw"), "targets.csv:1: no column 'yaw' (did you mean 'jaw'?)"),
         (TARGETS.replace("x [mm]", "X [mm],x [mm]"), "has 8 columns"),

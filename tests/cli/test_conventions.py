@@ -104,7 +104,9 @@ def test_validate_uses_the_frame_estimated_by_the_run(loopcal, folder, placed_ru
         "validation.setup-fitted"
     }
     loopcal(
-        "validate run more.csv --refit tracker", "is called 'tracker'; the data have: frame", code=1
+        "validate run more.csv --refit tracker",
+        "has the name 'tracker'; the data have: frame",
+        code=1,
     )
 
 

@@ -101,5 +101,5 @@ def test_defect_without_a_place_for_the_report_is_still_one_sentence(monkeypatch
     monkeypatch.setattr(robot_commands.check, "callback", lambda **_: 1 / 0)
     assert main(["check", "hexapod-42"]) == 3
     err = capsys.readouterr().err
-    assert "The report could not be saved: send the developers this message, the command" in err
+    assert "Saving the report failed: send the developers this message, the command" in err
     assert version("loopcal") in err

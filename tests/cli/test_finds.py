@@ -125,7 +125,7 @@ FINDS = {
             "e.txt": "A, G, 1_T, 1, 2, 3\n",
             "s.csv": POSITION.replace("pose,", "") + "180,190,200,,,\n",
         },
-        "s.csv:3: no column 'pose', which the points of an export are joined with. Add it\n",
+        "s.csv:3: no column 'pose', to join the points of an export with. Add it\n",
     ),
 }
 """Case -> a command line, the files that it reads, and what it says."""

@@ -175,9 +175,12 @@ def test_existing_file_is_replaced_only_with_force(loopcal, folder, data_folder)
         ),
         (
             "export hexapod-42 --format klipper -o x.cfg",
-            "is not a robot of the family linear-delta",
+            "holds a robot of the family linear-delta, not",
         ),
-        ("export linear-delta --format linuxcnc -o x.hal", "is not a hexapod of the family gough"),
+        (
+            "export linear-delta --format linuxcnc -o x.hal",
+            "holds a hexapod of the family gough, not",
+        ),
         ("export linear-delta -o x.csv --into y.csv", "the format csv makes a new file"),
         (
             "export linear-delta --format klipper --into no.cfg -o x.cfg",

@@ -75,7 +75,7 @@ def test_json_contains_combinations_suggestions_reduction_and_indices(loopcal):
         ("3-prs data.csv --measure x", "DATA defines the instrument"),
         ("3-prs -o smaller.yaml", "-o writes the robot of --reduce"),
         (f"{READ}=5", "--sigma-reading '5' for q1: '5' has no unit"),
-        (f"{READ}=5urad", "'urad' is a unit of angle, but a length is needed"),
+        (f"{READ}=5urad", "'urad' is a unit of angle, not of a length"),
         (f"{READ}=-5um", "for q1 is -5um. Give a number above zero, or zero for exact"),
         (f"{READ}=q9=5um", "--sigma-reading names 'q9'"),
         (f"{READ}=q1=5um,q2", "--sigma-reading 'q2' for q1: "),

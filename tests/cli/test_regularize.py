@@ -26,7 +26,7 @@ def loopcal(loopcal):
 def test_page_shows_both_curves_and_what_rules_choose(loopcal) -> None:
     _, out, err = loopcal("regularize linear-delta data.csv")
     assert err == ""
-    assert "linear-delta: 16 poses, 9 parameters; each pose was left out in turn" in out
+    assert "linear-delta: 16 poses, 9 parameters; each pose left out in turn" in out
     for words in ("given robot", "GCV", "marginal likelihood", "one standard error", "lam", "k ="):
         assert words in out
 

@@ -132,7 +132,7 @@ def test_region_shows_intervals_for_all_at_once_and_the_joint_region(loopcal, fo
         (["sample", "hexapod-42", "DATA", "--method", "ridge"], "penalty without a probability"),
         (
             ["sample", "RUN", "--region", "-p", "leg9.base.x"],
-            "no free parameter is called 'leg9.base.x'",
+            "no free parameter has the name 'leg9.base.x'",
         ),
         (["sample", "RUN", "--region", "--level", "1.5"], "1.5"),
         (["sample", "RUN", "--region", "--seed", "1"], "--seed has no effect with --region"),

@@ -146,7 +146,7 @@ def test_folder_in_use_changed_study_other_version_and_two_drivers_are_refused(
     loopcal(f"{start} --resume", "seed: 3 -> 4", code=1)
     with open_store(tmp_path / "f") as store:
         loopcal("extend f --replicates 8", "another process computes this study now", code=1)
-        loopcal("status f", "it is being computed now")
+        loopcal("status f", "computation continues")
         store.connection.execute("PRAGMA user_version = 9")
     for words in ("status f", "summary f", "extend f --replicates 8"):
         loopcal(words, "has format 9", code=1)

@@ -133,7 +133,7 @@ def test_reduced_robot_file_extends_the_fixed_list_and_keeps_identified_values(l
 
 
 def test_robot_without_a_file_cannot_be_reduced():
-    with pytest.raises(MechanismError, match="was not loaded from a robot file"):
+    with pytest.raises(MechanismError, match="does not come from a robot file"):
         format_reduced_robot(hexapod(), {})
 
 

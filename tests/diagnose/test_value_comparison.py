@@ -102,7 +102,7 @@ def test_validation_keeps_the_frame_of_the_fit_unless_a_refit_is_requested(fit):
     assert "validation.setup-fitted" in [f.code for f in anew.findings]
     assert anew.after.statistics("position").rms <= kept.after.statistics("position").rms
     assert json.loads(to_json(anew.to_dict()))["alignment"]["fitted"] == ["frame"]
-    with pytest.raises(DataError, match=r"is called 'tracker'; the data have: frame"):
+    with pytest.raises(DataError, match=r"has the name 'tracker'; the data have: frame"):
         validate(fit, others, refit=("tracker",))
 
 

@@ -152,7 +152,7 @@ def test_ridge_with_correlated_tolerances_advises_what_helps(delta: Mechanism) -
 
 
 def test_names_of_common_errors_differ(tmp_path: Path) -> None:
-    with pytest.raises(MechanismError, match="two common errors are called 'batch of rods'"):
+    with pytest.raises(MechanismError, match="two common errors have the name 'batch of rods'"):
         delta_with(f"{RODS}\n  - {RODS}", tmp_path)
 
 

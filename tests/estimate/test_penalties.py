@@ -81,7 +81,7 @@ def test_ridge_with_lambda_per_parameter_equals_penalty_rows(rows):
 def test_lambda_by_pattern_is_that_of_the_most_exact_pattern_and_zero_without_one(lam, expected):
     names = ["leg1.base.x", "leg1.length", "leg2.base.x", "leg2.length"]
     assert Ridge(lam).resolve(names) == Ridge(tuple(expected))
-    with pytest.raises(DataError, match=r"no parameter is named 'leg3\.\*'"):
+    with pytest.raises(DataError, match=r"no parameter has the name 'leg3\.\*'"):
         Ridge({**lam, "leg3.*": 1.0}).resolve(names)
     with pytest.raises(EstimationError, match="a finite number >= 0"):
         Ridge({**lam, "*": -1.0})

@@ -96,7 +96,7 @@ MISTAKES = {
             "# places: [[300 mm, -250 mm, 0 mm]]\n",
             "",
         ),
-        "base.csv:3: the places of N1, N2, N3 on the base are neither stated nor unknown",
+        "base.csv:3: the places of N1, N2, N3 on the base are neither given nor unknown",
     ),
     "a separate frame": (
         ("unknown: [frame]", "unknown: [frame]\n# frame: tracker"),

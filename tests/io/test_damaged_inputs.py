@@ -91,7 +91,7 @@ def load(folder, settings: dict[str, str], columns: str = "", cells: str = "") -
         ("places", "[[0 mm, 0 mm, 0 mm], [1 mm]]", "lists of equal length"),
         ("places", "[null]", "lists of equal length"),
         ("places", "[[1e160 m, 0 m, 0 m]]", "exceeds 1e\\+09 m"),
-        ("places", "null", "'places' is empty, but a list is needed"),
+        ("places", "null", "'places' is empty, but must be a list"),
         ("kind", "[position]", "is not a kind of measurement"),
         ("kind", "{a: 1}", "is not a kind of measurement"),
         ("targets", "null", "'targets' is empty"),

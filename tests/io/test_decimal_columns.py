@@ -60,7 +60,7 @@ def test_the_first_wrong_cell_of_a_column_is_reported_behind_any_number_of_decim
     file = tmp_path / "data.csv"
     cells[123], cells[321], cells[400] = "1.5e1", "1,5", "x"
     file.write_text("q [mm]\n" + "\n".join(f'"{cell}"' for cell in cells) + "\n")
-    with pytest.raises(FileError, match=r":323: column 'q' is '1,5', but a number is needed"):
+    with pytest.raises(FileError, match=r":323: column 'q' is '1,5', but must be a number"):
         read_table(file).numbers("q", Dimension.LENGTH)
     cells[321], cells[400] = "", "2.5"
     file.write_text("n,q [mm]\n" + "\n".join(f"1,{cell}" for cell in cells) + "\n")

@@ -129,7 +129,7 @@ def test_folder_that_cannot_be_removed_is_not_replaced() -> None:
         code, said = run_in_copy(replace_protected)
         assert code == 0
         assert (said[0], said[1], said[3]) == ("", "", "")
-        assert said[2].startswith(f"{path}: this folder is protected against changes")
+        assert said[2].startswith(f"{path}: this folder permits no changes")
         assert (read_value(path), [p.name for p in place.iterdir()]) == (3, ["run"])
     finally:
         shutil.rmtree(place)

@@ -227,7 +227,7 @@ BAD_PROFILES = {
         "X, unit: mm",
         "X, unit: deg",
         6,
-        "'x': 'deg' is a unit of angle, but a length is needed",
+        "'x': 'deg' is a unit of angle, not of a length",
     ),
     "one unit for a covariance": ("  z:", "  cov.x.y: {from: C, unit: mm}\n  z:", 8, "not a unit"),
     "an unknown sigma": (

@@ -147,7 +147,7 @@ REFUSED = {
                                                                                   r"unknown pose "
                                                                                   r"'e'")),
     "no names": ({"poses": POSES, "heights": HEIGHTS.replace("pose,z", "note,z")}, ("this file "
-                                                                                   "names none")),
+                                                                                   "has none")),
     "no kind at all": ({"poses": POSES, "more": POSES.replace("a,0", "f,0")}, ("no file has a "
                                                                               "kind")),
     "no kind for measured columns": (
@@ -161,7 +161,7 @@ REFUSED = {
     ),
     "the unit of a reading": (
         {"poses": POSES.replace("q3 [mm]", "q3 [deg]"), "heights": HEIGHTS},
-        r"poses.csv:1: column 'q3': 'deg' is a unit of angle, but a length is needed",
+        r"poses.csv:1: column 'q3': 'deg' is a unit of angle, not of a length",
     ),
     "another unit of readings by mistake": (
         {"poses": POSES, "tilts": TILTS.replace(" [m]", " [mm]")},
@@ -169,7 +169,7 @@ REFUSED = {
     ),
     "an empty cell of the readings": (
         {"poses": POSES.replace("b,1,", "b,,"), "heights": HEIGHTS},
-        ("poses.csv:3: column 'q1' is empty. Write its value, or state 'reading_noise'"),
+        ("poses.csv:3: column 'q1' is empty. Write its value, or give 'reading_noise'"),
     ),
     "another block": (IN_BLOCKS, (r"tilts.csv:4: pose 'b' is in block '2' here and '1' in "
                                   r".*poses.csv:3")),
@@ -185,7 +185,7 @@ REFUSED = {
         {"poses": POSES,
          "mo": SPLIT.format("x").replace("# frame", "# unknowns: {x.tracker.x: fixed}\n# frame") + "a,200\nb,201\n",  # noqa: E501
          "tu": SPLIT.format("x").replace("# frame", "# unknowns: {x.tracker.x: {sd: 1 mm}}\n# frame") + "λ1,203.3\n"},  # noqa: E501
-        r"tu.csv:5: parameter 'x.tracker.x' is stated differently in .*mo.csv:5",
+        r"tu.csv:5: parameter 'x.tracker.x' differs from .*mo.csv:5",
     ),
 }  # fmt: skip
 
@@ -200,9 +200,9 @@ def test_inconsistent_files_are_refused_with_their_lines(write_files, robot, cas
 
 def test_file_given_twice_is_refused(write_files, robot) -> None:
     (path,) = write_files(data=HEIGHTS)
-    with pytest.raises(LoopcalError, match="this file is given twice"):
+    with pytest.raises(LoopcalError, match="this file occurs twice"):
         load_measurements([path, path.parent / "." / path.name], robot)
-    with pytest.raises(LoopcalError, match="no measurement file is given"):
+    with pytest.raises(LoopcalError, match="the list of measurement files is empty"):
         load_measurements([], robot)
 
 

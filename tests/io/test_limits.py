@@ -56,7 +56,7 @@ def test_pipes_and_devices_are_refused_at_once(tmp_path) -> None:
     for path in (tmp_path / "pipe", Path("/dev/zero"), Path("/dev/tty")):
         if path.exists():
             for read in (lambda p: read_bytes(p, "robot file"), sha256, load_robot, read_table):
-                with pytest.raises(FileError, match=r"device or a pipe|cannot be read"):
+                with pytest.raises(FileError, match=r"device or a pipe|cannot read"):
                     read(path)
 
 
@@ -120,7 +120,7 @@ def test_copies_and_limbs_are_limited_before_they_are_made(tmp_path) -> None:
     for count in (1_000_000_000, 101, 0, -1):
         with pytest.raises(MechanismError, match=rf"limb 'west' has {count} copies. Give 1 to 100"):
             load(count)
-    with pytest.raises(MechanismError, match="five-bar has 110 limbs, but at most 100"):
+    with pytest.raises(MechanismError, match=r"five-bar has 110 limbs. Allowed: at most 100"):
         load(50, 60)
 
 
@@ -177,7 +177,7 @@ def test_arrays_are_read_as_numpy_wrote_them(tmp_path) -> None:
 
 def test_zip_bomb_is_refused_before_it_is_expanded(tmp_path) -> None:
     bomb = npy(np.zeros(10**6))
-    with pytest.raises(ValueError, match=r"'x\.npy' is compressed"):
+    with pytest.raises(ValueError, match=r"compression of 'x\.npy'"):
         read_arrays(archive(tmp_path, {"x": bomb}, zipfile.ZIP_DEFLATED))
     limit = limits.FileLimit("", 1, "MB", "", "repeat the calibration")
     with pytest.raises(FileError, match=r"8\.01 MB, but the limit is 1"):

@@ -198,9 +198,9 @@ STATEMENTS = (
     ("sd: 1 mm", "sd: 1", "'1' has no unit"),
     ("start: 12 mm", "start: 12 mrad", "start': 'mrad' is a unit of angle"),
     ("sd: 1 mm", "sd: 0 mm", "the standard deviation is 0 mm"),
-    ("start: 12 mm, sd: 1 mm", "start: 12 mm", "state either 'sd' or 'fixed"),
-    ("sd: 1 mm", "sd: 1 mm, fixed: true", "state either 'sd' or 'fixed"),
-    ("ball.x: fixed", "ball.x: free", "'free' does not state knowledge.*write 'fixed'"),
+    ("start: 12 mm, sd: 1 mm", "start: 12 mm", "give either 'sd' or 'fixed"),
+    ("sd: 1 mm", "sd: 1 mm, fixed: true", "give either 'sd' or 'fixed"),
+    ("ball.x: fixed", "ball.x: free", "'free' gives no knowledge.*write 'fixed'"),
     ("sd: 1 mm", "sd: 1 mm, stat: 3 mm", "unknown key 'stat'.*did you mean 'start'"),
     ("tracker.r?", "tracker.*", "matches lengths and angles"),
     (UNKNOWNS, "[ball.x]", "'unknowns' must name"),
@@ -220,9 +220,14 @@ REFUSED = {
     CONTEXT: [
         ("[degC]", "[mm]", 4, "'temperature' has the unit 'mm'. Write one of .degC., .K., .degF."),
         (" [degC]", "", 4, "column 'temperature' has no unit"),
-        ("2026-05-04T10:22:31.5", "4.5.2026 10:22", 5, "'time' is '4.5.2026 10:22', but a date"),
+        (
+            "2026-05-04T10:22:31.5",
+            "4.5.2026 10:22",
+            5,
+            "'time' is '4.5.2026 10:22', but must be a date",
+        ),
         ("temperature.frame", "temperature.", 4, "column 'temperature.' is unknown"),
-        (",20.5,", ",warm,", 5, "column 'temperature' is 'warm', but a number"),
+        (",20.5,", ",warm,", 5, "column 'temperature' is 'warm', but must be a number"),
     ],
 }
 CASES = [(text, *case) for text, cases in REFUSED.items() for case in cases]
@@ -239,10 +244,10 @@ def test_invalid_file_is_refused_with_its_line(tmp_path, robot, text, old, new, 
 @pytest.mark.parametrize("name", ["a;b", "two\nlines", " a", ""])
 def test_pose_name_that_cannot_be_written_is_refused_before_writing(tmp_path, robot, name) -> None:
     data = Measurements(robot.name, np.zeros((1, 6)), (), labels=(name,))
-    with pytest.raises(DataError, match=r"cannot be written: names|contains U\+000A"):
+    with pytest.raises(DataError, match=r"cannot write the .*: names|contains U\+000A"):
         save_measurements(data, tmp_path / "data.csv", robot)
     twice = Measurements(robot.name, np.zeros((2, 6)), (), labels=("a", "a"))
-    with pytest.raises(DataError, match="two poses are named 'a'"):
+    with pytest.raises(DataError, match="two poses have the name 'a'"):
         save_measurements(twice, tmp_path / "data.csv", robot)
     assert not (tmp_path / "data.csv").exists()
 

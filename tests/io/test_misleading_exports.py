@@ -259,8 +259,8 @@ HEADER = (
 FRONT = "# kind: position\n# noise: {'*': 1 um}\n"
 ROWS = FRONT + HEADER + "".join(f"P{i},{i},0,{i % 3},0,0,{i % 2},20,{i},2,3\n" for i in range(4))
 REFUSED = {
-    "semicolons": (ROWS.replace(",", ";"), "columns are separated by semicolons.*profile"),
-    "tabs": (ROWS.replace(",", "\t"), "columns are separated by tabs.*profile"),
+    "semicolons": (ROWS.replace(",", ";"), "semicolons separate the columns.*profile"),
+    "tabs": (ROWS.replace(",", "\t"), "tabs separate the columns.*profile"),
     "latin-1": (("## Länge\n" + ROWS).encode("latin-1"), "is not UTF-8 text .*profile"),
     "utf-16": (ROWS.encode("utf-16"), "is not UTF-8 text .*profile"),
     "capitals": (

@@ -107,7 +107,7 @@ def test_files_state_numbers_in_ascii_digits(tmp_path, text) -> None:
         parse_quantity(f"{text} mm")
     for unit, dimension in (("mm", Dimension.LENGTH), ("deg", Dimension.ANGLE)):
         (tmp_path / "data.csv").write_text(f"pose,a [{unit}]\n1,1\n2,{text}\n", encoding="utf-8")
-        with pytest.raises(FileError, match=r"but a number is needed"):
+        with pytest.raises(FileError, match=r"but must be a number"):
             read_table(tmp_path / "data.csv").numbers("a", dimension)
 
 

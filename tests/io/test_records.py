@@ -91,26 +91,26 @@ def test_numbers_are_converted_to_si_units_and_defaults_are_not() -> None:
     ("old", "new", "line", "message"),
     [
         ("name: h\n", "", None, "no key 'name'"),
-        ("- [1, 2, 3]", "- [1, 2]", 7, "'leg.base entry 1' has 2 values, but 3"),
-        ("- [1, 2, 3]", "- [1]", 7, "'leg.base entry 1' has 1 values, but 3"),
-        ("- [1, 2, 3]", "- [1, 2, 3, 4]", 7, "has 4 values, but 3 are needed. Remove"),
-        ("- [1, 2, 3]", "- 5", 7, "is the number 5, but a list"),
+        ("- [1, 2, 3]", "- [1, 2]", 7, "'leg.base entry 1' has 2 values, but must have 3"),
+        ("- [1, 2, 3]", "- [1]", 7, "'leg.base entry 1' has 1 values, but must have 3"),
+        ("- [1, 2, 3]", "- [1, 2, 3, 4]", 7, "has 4 values, but must have 3. Remove"),
+        ("- [1, 2, 3]", "- 5", 7, "is the number 5, but must be a list"),
         (
             "[1, 2, 3]",
             "[1, '2', 3]",
             7,
-            "is the text '2', but a number is needed. Write the number without quotes",
+            "is the text '2', but must be a number. Write the number without quotes",
         ),
-        ("[1, 2, 3]", "[1, 2mm, 3]", 7, "is the text '2mm', but a number"),
-        ("[1, 2, 3]", "[1, nan, 3]", 7, "is the text 'nan', but a number"),
+        ("[1, 2, 3]", "[1, 2mm, 3]", 7, "is the text '2mm', but must be a number"),
+        ("[1, 2, 3]", "[1, nan, 3]", 7, "is the text 'nan', but must be a number"),
         ("[1, 2, 3]", "[1, .nan, 3]", 7, "is nan. Write a finite number"),
         ("[1, 2, 3]", "[1, -.inf, 3]", 7, "is -inf. Write a finite number"),
         ("[1, 2, 3]", "[1, 1e999, 3]", 7, "Write a finite number"),
-        ("[1, 2, 3]", "[1, true, 3]", 7, "is the value true, but a number"),
+        ("[1, 2, 3]", "[1, true, 3]", 7, "is the value true, but must be a number"),
         ("[1, 2, 3]", "[1, , 3]", 7, "not valid YAML"),
-        ("[1, 2, 3]", "!foo 5", 7, "YAML tags are not allowed"),
-        ("[1, 2, 3]", "!!int ''", 7, "YAML tags are not allowed"),
-        ("[1, 2, 3]", "!!omap x", 7, "YAML tags are not allowed"),
+        ("[1, 2, 3]", "!foo 5", 7, "must not have YAML tags"),
+        ("[1, 2, 3]", "!!int ''", 7, "must not have YAML tags"),
+        ("[1, 2, 3]", "!!omap x", 7, "must not have YAML tags"),
         ("[1, 2, 3]", "=", 7, "Put it in quotes"),
         ("legs: rod", "legs: rood", 5, "'leg.legs' is 'rood' .did you mean 'rod'"),
         ("legs: rod", "legs: ups", 6, "unknown key 'base' in 'leg'. Allowed: joints, legs"),
@@ -119,13 +119,13 @@ def test_numbers_are_converted_to_si_units_and_defaults_are_not() -> None:
         ("length: mm, ", "", 2, "'units' has no key 'length'. Add it"),
         ("length: mm", "length: mmm", 2, "'units.length' is 'mmm' .did you mean 'mm'"),
         ("length: mm", "length: deg", 2, "'units.length' is 'deg'. Allowed: 'm', 'mm'"),
-        ("name: h", "name: 3", 3, "is the number 3, but text"),
-        ("name: h", "name: h\ncount: 3.5", 4, "is the number 3.5, but a whole number"),
+        ("name: h", "name: 3", 3, "is the number 3, but must be text"),
+        ("name: h", "name: h\ncount: 3.5", 4, "is the number 3.5, but must be a whole number"),
         ("name: h", "name: h\nmode: u", 4, "'mode' is 'u'.*. Allowed: 'up', 'down'"),
         ("name: h", "name: h\nname: g", 4, "duplicate key 'name'"),
         ("name: h", "name: h\n3: g", 4, "key 3 is not text"),
         ("name: h", "name: [h", 4, "not valid YAML"),
-        ("{sd: 0.5}", "0.5", 11, "is the number 0.5, but a mapping is needed"),
+        ("{sd: 0.5}", "0.5", 11, "is the number 0.5, but must be a mapping"),
         ("name: h", "name: +_", None, "not valid YAML"),
         (GOOD, "%YAML 1.1\n---\n" + GOOD, 1, "YAML directives"),
         (GOOD, "- 1\n- 2\n", None, "contains no 'key: value' lines"),
@@ -168,7 +168,7 @@ def test_file_that_is_not_text_is_refused(
 
 
 def test_folder_and_missing_file_are_refused(tmp_path) -> None:
-    with pytest.raises(FileError, match="this is a folder, but a robot file is needed"):
+    with pytest.raises(FileError, match="this is a folder, not a robot file"):
         read_yaml(tmp_path, "robot file")
     with pytest.raises(FileError, match="this robot file does not exist"):
         read_yaml(tmp_path / "absent.yaml", "robot file")

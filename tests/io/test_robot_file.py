@@ -73,7 +73,7 @@ def test_identified_table_in_the_middle_of_a_file_is_replaced(tmp_path, robot) -
 
 
 def test_robot_without_a_file_cannot_be_saved(tmp_path, robot) -> None:
-    with pytest.raises(MechanismError, match="was not loaded from a robot file"):
+    with pytest.raises(MechanismError, match="does not come from a robot file"):
         save_robot(build(robot.assembly), tmp_path / "r.yaml")
     assert list(tmp_path.iterdir()) == []
 
@@ -92,9 +92,9 @@ def test_robot_without_a_file_cannot_be_saved(tmp_path, robot) -> None:
         ("family: gough\n", "", "names no family. Write 'family:' and one of .*gough"),
         ("units: {length: mm, angle: deg}\n", "", "has no units"),
         ("stroke: [-75, 75]", "strokes: [-75, 75]", "unknown key 'strokes' .did you mean 'stroke'"),
-        ("stroke: [-75, 75]", "stroke: [-75]", "'stroke' has 1 values, but 2"),
-        ("[120, -140, 0]", "[120, -140]", "'base entry 1' has 2 values, but 3"),
-        ("[120, -140, 0]", "[120, '-140', 0]", "is the text '-140', but a number is needed"),
+        ("stroke: [-75, 75]", "stroke: [-75]", "'stroke' has 1 values, but must have 2"),
+        ("[120, -140, 0]", "[120, -140]", "'base entry 1' has 2 values, but must have 3"),
+        ("[120, -140, 0]", "[120, '-140', 0]", "is the text '-140', but must be a number"),
         ("[120, -140, 0]", "[120, .nan, 0]", "is nan. Write a finite number"),
         ("home: {z: 200}", "home: {z: 200}\nhome: {z: 200}", "duplicate key 'home'"),
         ("home: {z: 200}", "home: {zz: 200}", "unknown key 'zz' in 'home'"),

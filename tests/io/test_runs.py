@@ -44,7 +44,7 @@ def test_changed_or_missing_measurements_of_a_run_are_refused(tmp_path, calibrat
     copy.write_bytes(DATA.read_bytes())
     lc.save_run(report, tmp_path / "run", {"data": copy})
     copy.write_bytes(DATA.read_bytes() + b"\n")
-    with pytest.raises(FileError, match="was changed since the run"):
+    with pytest.raises(FileError, match="differs from the file of the run"):
         lc.load_run(tmp_path / "run").load_measurements()
     lc.save_run(report, tmp_path / "bare")
     with pytest.raises(FileError, match="names no measurement files"):

@@ -288,7 +288,7 @@ def test_a_prior_without_a_session_holds_in_every_session_in_python(tmp_path):
     [
         ("scale: 2 ppm", "Write 'scale: {sd: 2 ppm}'"),
         ("scale: {}", "Write 'scale: {sd: 2 ppm}'"),
-        ("scale: {mean: 2 ppm}", "an uncertainty is stated once"),
+        ("scale: {mean: 2 ppm}", "an uncertainty has one form"),
         ("scale: {sd: 2}", "Write a number and one of 1, ppm, um/m"),
         ("scale: {sd: 2 mm}", "Write a number and one of 1, ppm, um/m"),
         ("scale: {sd: nan ppm}", "Write a number and one of"),
@@ -395,7 +395,9 @@ def test_all_sessions_can_share_the_offset_of_a_bar_but_no_frame(tmp_path):
     save_measurements(tracked, path, ROBOTS["hexapod-42"])
     text = path.read_text("utf-8")
     path.write_text("# unknowns: {frame.x: {scope: all}}\n" + text, "utf-8")
-    with pytest.raises(lc.LoopcalError, match=r"of 'frame\.x' is all, but only offsets"):
+    with pytest.raises(
+        lc.LoopcalError, match=r"of 'frame\.x' is all, but sessions share only offsets"
+    ):
         load_measurements(path, ROBOTS["hexapod-42"])
 
 

@@ -79,7 +79,7 @@ def test_every_session_and_group_has_separate_parameters():
 def test_name_with_two_different_statements_is_refused():
     elsewhere = Position(targets=("ball",), places=np.ones((1, 3)), unknown=("targets",))
     with pytest.raises(
-        DataError, match=r"states the parameter 'ball.x' as 1 .*another kind defines it as 0"
+        DataError, match=r"defines the parameter 'ball.x' as 1 .*another kind defines it as 0"
     ):
         collect_nuisance_parameters([make_rows(TRACKER), make_rows(elsewhere)], LEVEL)
     turned = Direction(

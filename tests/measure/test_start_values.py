@@ -161,8 +161,7 @@ def test_points_in_one_plane_need_a_stated_side():
     T[:, 2, 3] = 0.8
     data, local, truth = simulate_rows(Distance(places=NO_PLACE, unknown=("anchor",)), T, rng)
     with pytest.raises(
-        DataError,
-        match=r"'anchor' were measured from points in one plane, so it can be on either side",
+        DataError, match=r"'anchor' begin at points of one plane, so it can be on either side"
     ):
         guess_nuisance_values(data, T, local)
     side = np.array([0.0, 0.0, 0.8 + np.sign(truth[2] - 0.8)])

@@ -369,7 +369,7 @@ def test_study_of_another_hexapod_has_its_tables_figures_and_claims(tmp_path) ->
 def test_a_hexapod_with_more_parameters_is_said_to_have_the_poses_that_are_measured() -> None:
     case = PAPERS["hexapod-42"].make_case("6-rus")
     assert len(steps.make_setup(case).poses) == 14
-    assert "14 poses are drawn from the workspace of 6-rus" in " ".join(case.list_replaced())
+    assert "14 poses come from the workspace of 6-rus" in " ".join(case.list_replaced())
 
 
 def test_another_epsilon_ends_the_steps_and_is_stated() -> None:

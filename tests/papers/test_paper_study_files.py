@@ -135,7 +135,7 @@ def test_cells_of_a_sweep_are_the_batch_of_settings_of_the_reproduction():
             "hexapod-42",
             "hexapod-nategh-agheli",
             (
-                "10 poses are drawn from the workspace",
+                "10 poses come from the workspace",
                 "drawn errors with standard deviations of 1 mm in place of one machine",
             ),
             {"method": "per leg"},
@@ -145,7 +145,7 @@ def test_cells_of_a_sweep_are_the_batch_of_settings_of_the_reproduction():
             "linear-delta-6",
             (
                 "The robot is linear-delta-6 in place of 3-prs",
-                "36 poses are drawn",
+                "36 poses come",
                 "in place of 0.076 mm and 0.022 deg of 3-prs",
             ),
             {"method": "TSVD 14"},
@@ -159,7 +159,7 @@ def test_cells_of_a_sweep_are_the_batch_of_settings_of_the_reproduction():
         (
             "tsvd-2016",
             "five-bar",
-            ("36 poses are drawn", "instruments 3-DOF take the place of 6-DOF and 5-DOF"),
+            ("36 poses come", "instruments 3-DOF take the place of 6-DOF and 5-DOF"),
             {"method": "TSVD 4"},
         ),
     ],

@@ -502,7 +502,7 @@ def test_coordinate_without_levels_is_not_changed():
 
 
 def test_forbidden_first_design_and_too_few_points_are_refused():
-    with pytest.raises(EstimationError, match="group 1 of the first design is not allowed"):
+    with pytest.raises(EstimationError, match="group 1 of the first design is forbidden"):
         coordinate_exchange(
             parabola, np.array([[0.0], [np.nan], [1.0]]), LEVELS, Criterion("D"), NONE
         )

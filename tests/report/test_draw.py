@@ -48,7 +48,7 @@ def test_check_with_plot_writes_the_picture(tmp_path, capsys):
 
 def test_unknown_picture_format_is_refused(tmp_path):
     with pytest.raises(
-        FileError, match=r"written as '.docx'. Use a name that ends in .png, .svg, .pdf"
+        FileError, match=r"picture as '.docx'. Use a name that ends in .png, .svg, .pdf"
     ):
         save_figure(tmp_path / "robot.docx", draw_robot(zoo.hexapod()), write=write_bytes)
 

@@ -181,7 +181,7 @@ def test_fit_that_did_not_converge_has_last_values_only(five_bar) -> None:
     history = replace(five_bar.fit.history, status=lc.DescentStatus.OUT_OF_ITERATIONS)
     fit = replace(five_bar.fit, history=history)
     figure = draw_parameters(fit)
-    assert "no estimates" in figure.get_suptitle()
+    assert "not estimates" in figure.get_suptitle()
     assert not any("±" in text.get_text() for text in figure.axes[1].get_yticklabels())
     check(figure)
     assert "out of iterations after" in draw_convergence(fit).get_suptitle()

@@ -285,7 +285,7 @@ def test_a_replayed_trial_gives_the_scores_of_its_block():
     off = (fit.robot.values - truth.values)[places] / fit.free_parameters.tolerance
     assert_allclose(np.sqrt(np.mean(off**2)), expected, rtol=1e-6)
     for cell, number in ((1, 0), (0, 12), (0, -1)):
-        with pytest.raises(DataError, match="numbered from 0"):
+        with pytest.raises(DataError, match="have the numbers 0"):
             replay_trial(study, cell, number)
 
 

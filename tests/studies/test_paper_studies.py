@@ -166,7 +166,7 @@ scores: {held_out: 3}
     (scores,) = compute_cells(load_study(path))
     assert np.isfinite(scores["position"]).all()
     path.write_text(path.read_text("utf-8").replace("*.length", "*.lengths"), "utf-8")
-    with pytest.raises(FileError, match=r"study.yaml:10: 'm' of 'methods': no parameter is named"):
+    with pytest.raises(FileError, match=r"study.yaml:10: 'm' of 'methods': no parameter has"):
         load_study(path)
 
 
@@ -287,7 +287,7 @@ methods:
         ("method: least-squares", "method: per-leg, stop: step", 9, "per-leg with epsilon"),
         ("method: least-squares", "rows: raw, epsilon: 1, stop: dQint", 9, "per-leg with epsilon"),
         ("method: least-squares", "method: per-leg, steps: 0", 9, "must be from 1 to"),
-        ("method: least-squares", "method: per-leg, loss: huber", 9, "has no loss"),
+        ("method: least-squares", "method: per-leg, loss: huber", 9, "has neither loss"),
         ("method: least-squares", "method: per-leg, rows: raw", 9, "Remove 'rows'"),
         ("method: least-squares", "method: map, rows: products", 9, "choice: plane-line"),
         ("method: least-squares", "method: map, rows: rough", 9, "rows"),
@@ -343,7 +343,7 @@ CASES = {
     "hexapod, least squares": ("hexapod-42", FULL_POSE, "least-squares", 1.0, 42),
     "3-PRS, MAP": ("3-prs", FULL_POSE, "map", 1.0, 33),
     "delta, MAP": ("linear-delta", CAMERA, "map", 1.0, 9),
-    "hexapod, noise twice as large as stated": ("hexapod-42", FULL_POSE, "least-squares", 2.0, 42),
+    "hexapod, noise twice its sigma": ("hexapod-42", FULL_POSE, "least-squares", 2.0, 42),
 }
 
 

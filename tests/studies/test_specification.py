@@ -154,14 +154,14 @@ def test_poses_may_be_those_of_a_file(write, tmp_path):
     for old, new, words in (
         ("poses.csv", "none.csv", "lacks"),
         ("poses.csv", "others.csv, count: 3", "no other setting"),
-        ("file: poses.csv", "coordinates: [[0.0, 0.0, 0.0]]", "given by a file"),
-        ("file: poses.csv", "file: 3", "text is needed"),
+        ("file: poses.csv", "coordinates: [[0.0, 0.0, 0.0]]", "a file gives the poses"),
+        ("file: poses.csv", "file: 3", "must be text"),
     ):
         with pytest.raises(FileError, match=words) as caught:
             load_study(write(text.replace(old, new)))
         assert caught.value.line == 4
     robots = text.replace("poses.csv", "others.csv").replace("linear-delta", "hexapod-42")
-    with pytest.raises(FileError, match=r"4: the poses cannot be read: .*others\.csv"):
+    with pytest.raises(FileError, match=r"4: cannot read the poses: .*others\.csv"):
         load_study(write(robots))
 
 
@@ -239,7 +239,7 @@ DAMAGES = {
     "unknown key": ("seed: 5", "sead: 5", 3, "'seed'"),
     "seed": ("seed: 5", "seed: -5", 3, "'seed' is -5"),
     "replicates": ("replicates: 130", "replicates: 0", 4, "'replicates' is 0"),
-    "decimal": ("replicates: 130", "replicates: 13.5", 4, "a whole number is needed"),
+    "decimal": ("replicates: 130", "replicates: 13.5", 4, "must be a whole number"),
     "exponent": ("replicates: 130", "replicates: 1e3", 4, "without an exponent"),
     "no robot": ("robots: [linear-delta, five-bar]\n", "", None, "robots: [hexapod-42]"),
     "wrong robot": ("five-bar]", "five-baar]", 6, "five-bar"),
@@ -255,7 +255,7 @@ DAMAGES = {
     "plain instrument": ("  gauge: {kinds: [component], components: [x], sigma_position: 3 um}",
                          "  gauge: pose", 12, "must state its settings"),
     "noise": ("[1, 2.5]", "[1, -2]", 13, "above 0"),
-    "text noise": ("[1, 2.5]", "[1, two]", 13, "a number is needed"),
+    "text noise": ("[1, 2.5]", "[1, two]", 13, "must be a number"),
     "count": ("count: 20}\n  best", "count: 0}\n  best", 15, "count' is 0"),
     "choice": ("choice: planned", "choice: plannd", 16, "'planned'"),
     "parameter": ('"*.length"', '"*.lenght"', 19, "no parameter"),

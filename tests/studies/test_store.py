@@ -472,7 +472,7 @@ def test_more_replicates_and_further_levels_keep_finished_blocks(changed) -> Non
     [
         (replace(STUDY, seed=2), "seed: 1 -> 2"),
         (replace(STUDY, block=10), "block: 50 -> 10"),
-        (replace(STUDY, replicates=10), "replicates: 1000 -> 10 (more are allowed, but not fewer)"),
+        (replace(STUDY, replicates=10), "replicates: 1000 -> 10 (allowed: more)"),
         (replace(STUDY, errors={"small": ErrorsLevel(1.0)}), "errors/wide: removed"),
         (
             replace(STUDY, errors={**STUDY.errors, "wide": ErrorsLevel(3.0)}),

@@ -153,7 +153,7 @@ def test_the_page_explains_failed_trials(result: StudyResult) -> None:
     assert all(re.fullmatch(r"\d+ out of iterations", words) for words in failed)
     assert [row[4] for row in tabulate_medians(result.study, summary, ()).rows] == failed
     assert "poses  noise  method" in page
-    assert "without motions of frames that the measurements do not fix" in " ".join(page.split())
+    assert "exclude motions of frames that the measurements leave open" in " ".join(page.split())
     assert list_shown(result.study, summary) == ("position", "orientation", "covered_parameters")
     with pytest.raises(DataError, match=r"score is 'positon' .did you mean 'position'"):
         list_shown(result.study, summary, ["positon"])

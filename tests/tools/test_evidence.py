@@ -31,6 +31,15 @@ def test_fill_tables_replaces_the_block_and_keeps_the_text_around_it(tmp_path: P
     assert evidence.fill_tables(filled, tmp_path) == filled
 
 
+def test_block_with_a_value_shows_the_rows_that_have_it(tmp_path: Path) -> None:
+    table = {"columns": ["case", "met"], "rows": [["clean", "yes"], ["drift", "no"]]}
+    evidence.write_json(tmp_path / "cases.json", {"tables": {"all": table}})
+    page = "<!-- evidence: cases.all, met = no -->\n<!-- end -->\n"
+    filled = evidence.fill_tables(page, tmp_path)
+    assert filled.splitlines()[1:-1] == ["| case | met |", "| --- | --- |", "| drift | no |"]
+    assert evidence.fill_tables(filled, tmp_path) == filled
+
+
 @pytest.mark.parametrize(
     ("block", "sentence"),
     [

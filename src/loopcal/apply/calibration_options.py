@@ -31,7 +31,7 @@ def describe_wrong_share(share: float) -> str:
         return f"{fault}. Write 0.25 for a quarter"
     return (
         f"{fault}. Write {share / 100:g} for {share:g} %, or the number of poses to hold out "
-        "divided by that of all poses"
+        "divided by the number of all poses"
     )
 
 
@@ -189,7 +189,7 @@ def split_data(
         names = set(held_out)
         is_held_out = np.array([label in names for label in data.labels])
         if is_held_out.all():
-            raise DataError("all poses of the data are held out. Leave some to fit")
+            raise DataError("the validation takes all poses of the data. Leave some to fit")
         is_repeat = is_held_out & np.isin(data.repeats, data.repeats[~is_held_out])
         repeats = tuple(data.labels[i] for i in np.flatnonzero(is_repeat))
         return DataSplit(data.take(~is_held_out), data.take(is_held_out), 0.0, seed, repeats)

@@ -268,7 +268,7 @@ class CalibrationReport(DeferredFields, TableResult):
         return (
             f"{verdict[0].upper()}{verdict[1:]}: {self.robot.name}, {len(fit.names)} parameters "
             f"from {name_count(fitted, 'pose')}."
-            + (f" The limit of {' and '.join(missed)} is not met." if missed else "")
+            + (f" The limit of {' and '.join(missed)} fails." if missed else "")
         )
 
     def __str__(self) -> str:

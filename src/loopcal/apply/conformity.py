@@ -198,7 +198,7 @@ def judge_estimate(
     if not (np.isfinite(estimate) and uncertainty >= 0.0 and degrees > 0.0):
         raise EstimationError(
             f"an estimate of {estimate} with the uncertainty {uncertainty} and {degrees} degrees "
-            "of freedom cannot be compared. Give finite numbers, and an uncertainty of 0 or more"
+            "of freedom allows no comparison. Give finite numbers, and an uncertainty of 0 or more"
         )
     if uncertainty == 0.0:
         p, x = float(estimate <= limit), estimate

@@ -195,7 +195,7 @@ def build_instrument(
             )
         if name in description.kinds[:i]:
             raise DataError(
-                f"the kind {name!r} is named twice. Name it once, and add the second one to the "
+                f"the kind {name!r} occurs twice. Name it once, and add the second one to the "
                 "measurement file by hand"
             )
         fields = _setting_names(name)

@@ -372,7 +372,7 @@ def validate(
         if not any(fnmatchcase(owner, pattern) for owner in owners):
             listed = ", ".join(sorted(owners)) or "none"
             raise DataError(
-                f"no frame, target or surface of these data is called {pattern!r}"
+                f"no frame, target or surface of these data has the name {pattern!r}"
                 f"{suggest_names(pattern, owners)}; the data have: {listed}"
             )
     kept_before, kept = (

@@ -100,8 +100,8 @@ class Volume:
         free = [n for n in POSITION if n in robot.controlled and n not in self.ranges][:2]
         if len(free) < 2 or any(len(self.values.get(name, [0.0])) != 1 for name in free):
             raise DataError(
-                f"a radius needs two of x, y, z that {robot.name} is commanded in, without a range "
-                "and with one value as center. Leave out a range, or the radius"
+                f"a radius needs two controlled coordinates of {robot.name} among x, y, z, without "
+                "a range and with one value as center. Leave out a range, or the radius"
             )
         return tuple(free)
 

@@ -114,7 +114,7 @@ class CommandGroup(click.Group):
         names = self.list_commands(ctx)
         if args[0] not in names and not args[0].startswith("-"):
             similar = suggest_names(args[0], names)
-            ctx.fail(f"{args[0]!r} is not a command{similar}; see {ctx.command_path} --help")
+            ctx.fail(f"{args[0]!r} is not a command{similar}. See {ctx.command_path} --help")
         return super().resolve_command(ctx, args)
 
 
@@ -193,7 +193,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             if isinstance(command, click.Group) and len(words) > 1:
                 command = command.commands.get(words[1], command)
             if command is not None and not _has_working_folder():
-                sentence = "the working folder was removed. Change to a folder that exists."
+                sentence = "there is no working folder. Change to a folder that exists."
                 return _refuse(sentence, words)
             code = command_line.main(words, "loopcal", standalone_mode=False, obj=words)
             terminal.flush_output()
@@ -354,7 +354,7 @@ def describe_defect(error: BaseException, words: Sequence[str]) -> str:
     path = save_report("\n".join(lines))
     if path is None:
         return (
-            f"{sentence}. The report could not be saved: send the developers this message, the "
+            f"{sentence}. Saving the report failed: send the developers this message, the "
             f"command and the version {versions['loopcal']}"
         )
     return (

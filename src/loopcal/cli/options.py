@@ -204,7 +204,7 @@ def _parse_goal(text: str) -> tuple[float, str]:
     try:
         return parse_quantity(text, Dimension.LENGTH), "position"
     except UnitError as error:
-        raise UnitError(f"{error}; or give an angle, such as 10urad") from None
+        raise UnitError(f"{error}, or give an angle, such as 10urad") from None
 
 
 def _parse_condition(text: str) -> tuple[str, float]:
@@ -350,8 +350,8 @@ def data_option(help: str, **settings: Any) -> Any:  # noqa: A002
 ROBOT: Any = argument("ROBOT", shell_complete=complete_robot)
 RUN: Any = argument("RUN", type=FILE)
 AT: Any = option(
-    "Today's value of a condition of the robot file, such as temperature=35 or force.z=-500N. May "
-    "be given several times.",
+    "Today's value of a condition of the robot file, such as temperature=35 or force.z=-500N. "
+    "Repeatable.",
     multiple=True,
     type=CONDITION,
     metavar="NAME=VALUE",
@@ -378,8 +378,8 @@ def _parse_volume(text: str) -> tuple[str, Any]:
 def volume(**settings: Any) -> Any:
     """Declare the option for a working volume, of which `read_volume` makes one value."""
     return option(
-        "Volume for the largest position error: x=-40mm..40mm for a range of a controlled "
-        "coordinate, radius=40mm for a cylinder, theta=0deg,5deg for single values, or a CSV file "
+        "Volume for the largest position error. x=-40mm..40mm is a range of a controlled "
+        "coordinate, radius=40mm a cylinder, theta=0deg,5deg single values. Or a CSV file "
         "of points. Give each part. Other coordinates stay at home.",
         type=Parsed("volume", _parse_volume),
         multiple=True,
@@ -825,7 +825,7 @@ def _make_constraints(stated: Mapping[str, Any]) -> lc.Constraints:
         refuse_given(
             ("facing", "cone", "nearest", "farthest"),
             "give the position of the instrument with --seen-from",
-            "{option} belongs to a line of sight; {reason}",
+            "{option} belongs to a line of sight, {reason}",
         )
         return lc.Constraints(stated["min_margin"], stated["max_tilt"], None, **margins)
     sight = lc.LineOfSight(

@@ -190,7 +190,7 @@ def choose_error_frame(
         return refer_errors(robot, frame, reference, motions, followed)
     if origin is None or not origin.converged.all():
         raise EstimationError(
-            f"errors cannot be relative to pose {origin_name!r}, which the robot does not reach. "
+            f"the robot does not reach pose {origin_name!r}, to which errors should be relative. "
             "Use another pose, or another frame"
         )
     S = differentiate_pose(robot, robot.values[None], origin.q[None], origin.state)

@@ -494,7 +494,7 @@ def _find_places(available: tuple[str, ...], names: str | Sequence[str]) -> IntA
         matching = [i for i, known in enumerate(available) if fnmatchcase(known, name)]
         if not matching:
             similar = suggest_names(name, available)
-            raise EstimationError(f"no free parameter is called {name!r}{similar}")
+            raise EstimationError(f"no free parameter has the name {name!r}{similar}")
         chosen += [i for i in matching if i not in chosen]
     return np.array(chosen, dtype=np.int64)
 

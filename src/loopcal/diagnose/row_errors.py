@@ -109,7 +109,7 @@ class Statistics(dict[str, float]):
     def __getattr__(self, name: str) -> float:
         if name in self:
             return self[name]
-        raise AttributeError(f"no metric is called {name!r}; there are {', '.join(self)}")
+        raise AttributeError(f"no metric has the name {name!r}. Known: {', '.join(self)}")
 
 
 @dataclass(frozen=True, eq=False)

@@ -304,7 +304,7 @@ def refuse_other_dimensions(
     if stored.parameters.names != robot.parameters.names:
         raise EstimationError(
             f"{stored.name!r} does not have the parameters of {robot.name!r}. Give a robot file of "
-            "the same family and structure, or only the values to compare"
+            "equal family and structure, or only the values to compare"
         )
     for machine in (robot, stored):
         known, q = machine.values[None], draw_readings(machine)

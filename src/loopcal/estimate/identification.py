@@ -58,8 +58,8 @@ def prepare_fitted_data(fit: Identification, data: Measurements) -> Measurements
     """
     if data.n_poses != len(fit.pose_weights):
         raise DataError(
-            f"the data have {data.n_poses} poses, but the fit was made from "
-            f"{len(fit.pose_weights)}. Give the measurements that were fitted, without held-out "
+            f"the data have {data.n_poses} poses, but the fit has "
+            f"{len(fit.pose_weights)}. Give the measurements of the fit, without held-out "
             "poses"
         )
     return exclude_poses(fill_in_reading_sigma(fit.robot, data), fit.options.excluded_poses)
@@ -420,7 +420,7 @@ def identify_trials(
     check_type(trials, Trials, "trials", "as from simulate_trials(...)")
     check_threads(threads)
     if not len(trials):
-        raise EstimationError("there are no trials. Simulate at least one machine")
+        raise EstimationError("the set of trials is empty. Simulate at least one machine")
     options = merge_options(options, method)
     for name in ("loss", "prior", "nuisance", "excluded_poses"):
         value = getattr(options, name)

@@ -58,7 +58,7 @@ def register_loss(loss: type[L]) -> type[L]:
     DataError : there is no function `weight` or no name, or the name is one of loopcal.
     """
     if not callable(getattr(loss, "weight", None)):
-        raise DataError(f"{loss!r} is not a loss: it has no function 'weight(distance, degrees)'")
+        raise DataError(f"{loss!r} lacks the function 'weight(distance, degrees)' of a loss")
     return LOSSES.register(loss)
 
 

@@ -270,8 +270,7 @@ def _refuse_object(plain: Any) -> None:
     """Raise DataError for the text of an object that has no name."""
     if isinstance(plain, Mapping) and OBJECT in plain:
         raise DataError(
-            f"{plain[OBJECT]} has no name by which it could be made again; register its class "
-            "(docs/extending.md)"
+            f"{plain[OBJECT]} has no registered name. Register its class (docs/extending.md)"
         )
 
 

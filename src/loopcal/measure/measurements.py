@@ -327,8 +327,8 @@ class Measurements(TableResult):
         check_seed(seed)
         if not 0.0 < hold_out < 1.0:
             raise DataError(
-                f"cannot hold out a share of {hold_out}. Give the share of the poses that is not "
-                "fitted, above 0 and below 1, such as 0.25"
+                f"cannot hold out a share of {hold_out}. Give the share of the poses outside the "
+                "fit, above 0 and below 1, such as 0.25"
             )
         fitted = choose_fitted(self, hold_out, seed, regions)
         return self.take(fitted), self.take(~fitted)

@@ -228,7 +228,7 @@ def _enter(entries: dict[str, Parameter], parameter: Parameter, owner: str, kind
     existing = entries.setdefault(name, entry)
     if existing is not entry and existing != entry:
         raise DataError(
-            f"the kind {kind.name!r} states the parameter {name!r} as {entry.nominal:.9g} (scope "
+            f"the kind {kind.name!r} defines the parameter {name!r} as {entry.nominal:.9g} (scope "
             f"{entry.scope}), another kind defines it as {existing.nominal:.9g} (scope "
             f"{existing.scope}). Give it alike, or use another name"
         )
@@ -242,8 +242,8 @@ def _check_common(kind: Kind, common: Collection[str]) -> None:
         for name in (p.name for p in of_item.parameters if item not in may_be_common):
             if name in common:
                 raise DataError(
-                    f"the scope of {name!r} is all, but only offsets and common errors of an "
-                    "instrument, such as its scale, can be shared by all sessions. Leave it out"
+                    f"the scope of {name!r} is all, but sessions share only offsets and common "
+                    "errors of an instrument, such as its scale. Leave it out"
                 )
 
 
@@ -259,6 +259,6 @@ def _check_names(kind: Kind, references: dict[str, FloatArray]) -> None:
     for name, value in kind.references.items():
         if not np.array_equal(references.setdefault(name, value), value):
             raise DataError(
-                f"the kind {kind.name!r} states another orientation or place of {name!r} than the "
+                f"the kind {kind.name!r} gives another orientation or place of {name!r} than the "
                 "kind before. Give them alike, or use another name"
             )

@@ -42,7 +42,7 @@ def solve_commanded_poses(
     """
     solution = inverse(controller, commanded)
     if labels and len(labels) != len(solution):
-        raise DataError(f"{len(labels)} names are given for {len(solution)} poses. Name each pose")
+        raise DataError(f"{len(labels)} names for {len(solution)} poses. Name each pose")
     failed = np.flatnonzero(~solution.converged)
     if len(failed):
         first = int(failed[0])
@@ -205,7 +205,7 @@ def resolve_reading_sigma(robot: Mechanism, given: FloatArray | None, n: int) ->
     if robot.program.sigma is not None and np.any(given == 0.0):
         exact = robot.actuators[int(np.argwhere(given == 0.0)[0, 1])].name
         raise DataError(
-            f"the readings of {exact} are declared exact, but {robot.name!r} has "
+            f"the data declare exact readings of {exact}, but {robot.name!r} has "
             f"{len(robot.actuators)} actuators for {len(robot.freedoms)} degrees of freedom. "
             "Readings of redundant actuators cannot be exact. Give each a sigma above 0, a "
             "small one for very good encoders"

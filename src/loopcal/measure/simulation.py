@@ -436,8 +436,8 @@ def simulate_contacts(
     missing = [name for name in POSITION if name not in robot.controlled]
     if missing:
         raise DataError(
-            f"{robot.name} does not control {', '.join(missing)}, so its points cannot be "
-            "moved to planes and lines"
+            f"points on planes and lines need a robot that controls "
+            f"{', '.join(missing)}, unlike {robot.name}"
         )
     filled = tuple(
         replace(o, measured=np.nan_to_num(np.where(o.present, o.measured, 0.0)))
@@ -467,7 +467,7 @@ def simulate_contacts(
         q, T = _command(robot, commanded, sheet)
     raise DataError(
         f"{robot.name} does not bring all points to their surfaces: a gap of {largest:.3g} m is "
-        f"left after {STEPS} corrections. Simulate smaller errors"
+        f"open after {STEPS} corrections. Simulate smaller errors"
     )
 
 

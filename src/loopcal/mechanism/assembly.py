@@ -343,7 +343,7 @@ def is_serial(assembly: Assembly) -> bool:
 def refuse_more(most: int, count: int, subject: str, noun: str) -> None:
     """Raise MechanismError where `count` is above `most`: `subject count noun`."""
     if count > most:
-        raise MechanismError(f"{subject} {count} {noun}, but at most {most} are allowed. Use fewer")
+        raise MechanismError(f"{subject} {count} {noun}. Allowed: at most {most}")
 
 
 def select_rows(ending: str, freedoms: tuple[str, ...]) -> tuple[int, ...]:

@@ -241,7 +241,7 @@ def _find_slots(assembly: Assembly) -> dict[str, dict[Address, Slot]]:
             slots[address.owner][address] = slot
     if unknown:
         raise MechanismError(
-            f"a parameter is mapped onto {min(unknown)}, which this mechanism does not have. "
+            f"a parameter maps onto {min(unknown)}, which this mechanism does not have. "
             "Correct the map"
         )
     return slots
@@ -423,7 +423,7 @@ def _find_home(robot: Mechanism) -> State:
     movable = len(program.unknown_twists) - program.count_equations(free=True) - shared
     if len(robot.controlled) < movable:
         raise MechanismError(
-            f"{robot.name} can be moved in {movable} freedoms or more, but names only "
+            f"{robot.name} moves in {movable} freedoms or more, but names only "
             f"{len(robot.controlled)} controlled coordinates "
             f"({', '.join(robot.controlled)}). Name one for every freedom, or list fewer "
             f"`freedoms:`"
@@ -443,7 +443,7 @@ def _find_home(robot: Mechanism) -> State:
             refuse_uncontrolled(robot, robot.home_state)
         refuse_singular_home(robot, state)
         raise MechanismError(
-            f"the loops of {robot.name} cannot be closed at its home pose: "
+            f"the loops of {robot.name} do not close at its home pose: "
             f"{state.residual[0, 0] * 1e3:.3g} mm stay open. Check the joint centers, the lengths "
             "and `home:`"
         )

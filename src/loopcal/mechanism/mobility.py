@@ -111,7 +111,7 @@ def check_mobility(robot: Mechanism) -> None:
         raise MechanismError(finding)
     if len(robot.controlled) != movable:
         raise MechanismError(
-            f"{robot.name} can be moved in {movable} freedoms, but names "
+            f"{robot.name} moves in {movable} freedoms, but names "
             f"{len(robot.controlled)} controlled coordinates ({', '.join(robot.controlled)}). Name "
             f"{movable}"
         )
@@ -217,7 +217,7 @@ def _differentiate_controlled(robot: Mechanism, T: FloatArray) -> FloatArray:
 def _word_dependent(robot: Mechanism, count: int) -> str:
     """Return the sentence for controlled coordinates that depend on each other."""
     return (
-        f"{robot.name}: the coordinates {', '.join(robot.controlled)} cannot be set independently "
+        f"{robot.name} cannot set the coordinates {', '.join(robot.controlled)} independently "
         f"at home. Name {count} that the actuators move independently, of {', '.join(COORDINATES)}"
     )
 
@@ -300,7 +300,7 @@ def _check_names(assembly: Assembly) -> None:
     for kind, names in (("limb", limbs), ("actuator", actuators), ("coupling", rows)):
         for name in names:
             if names.count(name) > 1:
-                raise MechanismError(f"two {kind}s are called {name!r}. Give each its own name")
+                raise MechanismError(f"two {kind}s have the name {name!r}. Give each its own name")
     driven = [name for limb in assembly.limbs for name in limb.drives]
     read = assembly.driven_joints
     for name in read:
@@ -312,7 +312,7 @@ def _check_names(assembly: Assembly) -> None:
     unknown = sorted(set(driven) - set(read))
     if unknown:
         raise MechanismError(
-            f"a joint is driven by {unknown[0]!r}, which is not among the actuators. Add it or "
+            f"{unknown[0]!r} drives a joint and is not among the actuators. Add it or "
             "correct the name"
         )
 

@@ -442,7 +442,7 @@ class Mechanism(DrawnResult):
         if new.shape != (len(self.parameters),):
             raise MechanismError(
                 f"{self.name} has {len(self.parameters)} parameters, but values of shape "
-                f"{new.shape} were given. Give one value for each"
+                f"{new.shape} do not fit. Give one value for each"
             )
         if not np.isfinite(new).all():
             bad = self.parameters.names[int(np.argmin(np.isfinite(new)))]

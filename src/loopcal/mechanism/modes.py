@@ -110,7 +110,7 @@ def find_assembly_modes(
     readings = np.asarray(q, dtype=float).reshape(-1)
     if len(readings) != len(robot.actuators):
         raise DataError(
-            f"{len(readings)} readings were given, but {robot.name} has {len(robot.actuators)} "
+            f"{len(readings)} readings do not fit: {robot.name} has {len(robot.actuators)} "
             "actuators. Give one reading for each"
         )
     values = robot.values[None]
@@ -146,7 +146,7 @@ def find_working_modes(
     wanted = np.asarray(target, dtype=float).reshape(-1)
     if len(wanted) != len(robot.controlled):
         raise DataError(
-            f"{len(wanted)} coordinates were given; {robot.name} has {', '.join(robot.controlled)}"
+            f"{len(wanted)} coordinates do not fit: {robot.name} has {', '.join(robot.controlled)}"
         )
     if has_spare_drives(robot):
         raise DataError(

@@ -503,7 +503,7 @@ def forward(robot: Mechanism, q: ArrayLike, start: Solution | None = None) -> So
             readings = load_readings(robot, robot.values[None], readings[None], wrench)[0]
     if readings.ndim != 2 or readings.shape[1] not in (a, 2 * a):
         raise DataError(
-            f"{readings.shape[-1]} readings a row were given, but {robot.name} has {a} actuators "
+            f"{readings.shape[-1]} readings a row do not fit: {robot.name} has {a} actuators "
             f"({', '.join(actuator.name for actuator in robot.actuators)}). Give one reading for "
             "each"
         )
@@ -551,7 +551,7 @@ def inverse(robot: Mechanism, target: ArrayLike, start: Solution | None = None) 
         coordinates = np.atleast_2d(wanted)
         state = solve_in_mode(robot, partial(reach_coordinates, robot), coordinates, begin)
     else:
-        raise DataError(f"a target of shape {wanted.shape} was given. Allowed: {shapes}")
+        raise DataError(f"a target has the shape {wanted.shape}. Allowed: {shapes}")
     q = compute_readings(robot, values, state)[0]
     lost = (state.status == Status.CONVERGED) & ~np.isfinite(q).all(axis=-1)
     status = np.where(lost, np.int8(Status.UNREACHABLE), state.status)

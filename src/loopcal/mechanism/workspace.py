@@ -168,7 +168,7 @@ def sample_workspace(
             reason, count = rejected.most_common(1)[0]
             raise MechanismError(
                 f"{robot.name} reaches almost nothing of its workspace: {kept} of {tried} random "
-                f"positions (at least {MIN_REACHABLE_SHARE:.0%} are needed); most frequent reason: "
+                f"positions (at least {MIN_REACHABLE_SHARE:.0%} needed), most frequent reason: "
                 f"{reason} ({count} positions). Correct `workspace:`, the strokes or the limits"
             )
     drawn, solutions = zip(*batches, strict=True)
@@ -224,7 +224,7 @@ def list_tilt_rings(robot: Mechanism, n: int) -> FloatArray:
     rings, azimuths = len(RING_SHARES), n // len(RING_SHARES)
     if n < 1 or n % rings or not {"phi", "theta"} <= {*robot.controlled} <= {"phi", "theta", "z"}:
         raise MechanismError(
-            f"{n} poses of {robot.name} are not {rings} rings of equal tilt: take a multiple of "
+            f"{n} poses of {robot.name} are not {rings} rings of equal tilt. Take a multiple of "
             f"{rings} and a robot that controls phi and theta, or with z, alone"
         )
     ranges = workspace_ranges(robot)
@@ -291,7 +291,7 @@ def find_reachable(
     """Return which rows the machine reaches (n,), and all solved; count reasons of the others."""
     values, solution = robot.values[None], inverse(robot, coordinates)
     good = np.array(solution.closed)
-    rejected["the loops cannot be closed"] += int((~good).sum())
+    rejected["the loops do not close"] += int((~good).sum())
     for limit in evaluate_limits(robot, values, solution.q[None], solution.state):
         outside = good & ~(limit.margin[0] >= 0)
         rejected[f"{limit.name} is exceeded"] += int(outside.sum())

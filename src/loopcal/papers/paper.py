@@ -177,13 +177,13 @@ class StudyCase:
         for level, of_other in zip(first.poses.values(), other.poses.values(), strict=True):
             if level != of_other:
                 sentences.append(
-                    f"{of_other.count} poses are drawn from the workspace of {robot.name} in place "
+                    f"{of_other.count} poses come from the workspace of {robot.name} in place "
                     f"of the {level.count} of the study."
                 )
             elif of_other.choice == "tilts":
                 sentences.append(
                     f"{of_other.count} poses lie on rings of equal tilt in the workspace of "
-                    f"{robot.name} in place of that of {nominal.name}."
+                    f"{robot.name} in place of {nominal.name}."
                 )
         for kind in ("instruments", "methods"):
             before, after = (list(getattr(study, kind)) for study in (first, other))

@@ -315,8 +315,8 @@ class PlanOptions(PlanSettings):
         super().__post_init__()
         if self.n_poses is not None and self.goal is not None:
             raise DataError(
-                f"both a number of poses ({self.n_poses}) and an accuracy goal are given. Give one "
-                "of them"
+                f"a number of poses ({self.n_poses}) and an accuracy goal exclude each other. Give "
+                "one of them"
             )
         if self.allowed_poses is not None:
             poses = np.atleast_2d(np.array(self.allowed_poses, dtype=float))

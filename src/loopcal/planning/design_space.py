@@ -260,7 +260,7 @@ class DesignProblem:
         """Return the scoring whose mean design is the prior and all groups with the weight of n."""
         criterion, space, prior = self.criterion, self.space, self.prior
         if criterion.name == "E":
-            raise EstimationError("criterion E cannot be optimized. Choose D, I or A")
+            raise EstimationError("an exchange cannot optimize criterion E. Choose D, I or A")
         rows, weight = self.rows[self.allowed], n / len(self.allowed)
         o, p = space.nuisance.shape
         blocks = np.zeros((o + len(space.machine), space.n_unknowns))

@@ -607,7 +607,7 @@ def coordinate_exchange(
     excluded = np.flatnonzero(~is_allowed(rows))
     if len(excluded):
         raise EstimationError(
-            f"group {excluded[0]} of the first design is not allowed. Start from groups that are"
+            f"group {excluded[0]} of the first design is forbidden. Start from allowed groups"
         )
     random, moved = np.random.default_rng(0), np.tile(design, (PROBES, 1))
     for c, values in enumerate(levels):

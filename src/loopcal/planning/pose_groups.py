@@ -325,7 +325,7 @@ def count_poses_per_group(instrument: Instrument) -> int:
     links = sorted({sensor.kind.poses_per_row for sensor in instrument.sensors} - {1})
     if len(links) > 1:
         raise DataError(
-            f"kinds that compare {links[0]} and {links[1]} poses cannot be planned together. Plan "
+            f"kinds that compare {links[0]} and {links[1]} poses need separate plans. Plan "
             "one of them"
         )
     return links[0] if links else 1
@@ -340,7 +340,7 @@ def list_groups(
         return np.arange(poses)[:, None]
     if poses < k:
         raise DataError(
-            f"this instrument compares {k} poses, but only {poses} are allowed; relax a constraint"
+            f"this instrument compares {k} poses. Allowed: only {poses}. Relax a constraint"
         )
     return draw_combinations(np.arange(poses), k, most, rng)
 

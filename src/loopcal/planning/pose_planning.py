@@ -334,7 +334,7 @@ def plan_poses(problem: PlanningProblem, progress: Progress = report_no_progress
             return result
         return replace(result, curve=compute_error_curve(problem, progress))
     curve = find_sample_size(problem, progress)
-    assert curve.enough is not None, "a goal was given"
+    assert curve.enough is not None, "a goal exists"
     n = curve.enough
     # Validation poses are taken from the candidates, and D is not what the goal counts: both can
     # cost some more poses.

@@ -368,7 +368,7 @@ def _require_plain_sensors(instrument: Instrument) -> None:
         set(np.unique(label)) != {""} for s in instrument.sensors for label in (s.session, s.group)
     ):
         raise DataError(
-            "an instrument for planning is set up once. Leave out sessions and groups of its "
+            "an instrument for planning has one set-up. Leave out sessions and groups of its "
             "sensors"
         )
 
@@ -542,7 +542,7 @@ def _convert_curve(problem: PlanningProblem, designs: list[Design]) -> ErrorCurv
     target, expected = problem.options.target, []
     for made in designs:
         errors = problem.predict_errors(made.chosen)
-        assert errors is not None, "every design is determined"
+        assert errors is not None, "every design determines its errors"
         expected.append(errors)
     bounds = np.array([made.relaxed.bound for made in designs])
     return ErrorCurve(

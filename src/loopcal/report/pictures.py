@@ -85,8 +85,8 @@ def save_figure(path: Path, figure: Figure, *, write: Callable[[Path, bytes], ob
     ending = path.suffix.lower()
     if ending not in FORMATS:
         raise FileError(
-            f"a picture cannot be written as {path.suffix or 'no format'!r}. Use a name that ends "
-            "in "
+            f"loopcal cannot write a picture as {path.suffix or 'no format'!r}. Use a name that "
+            "ends in "
             f"{', '.join(FORMATS)}",
             path,
         )

@@ -382,9 +382,9 @@ ROWS = 9
 def view_regularization(curves: RegularizationCurves) -> list[Block]:
     """Return the page of regularization curves: what rules choose, then the curves."""
     left_out = (
-        "each pose was left out in turn, to first order"
+        "each pose left out in turn, to first order"
         if curves.scheme == "leave-one-out"
-        else f"{curves.left_out} folds of poses were left out and fitted again"
+        else f"{curves.left_out} folds of poses left out and fitted again"
     )
     page: list[Block] = [
         f"{curves.robot}: {curves.poses} poses, {curves.parameters} parameters; {left_out}.",

@@ -16,7 +16,7 @@ from typing import Any
 
 from loopcal.results.description import describe_json
 
-INFINITE = "infinite: these data do not determine it, or it is divided by zero"
+INFINITE = "infinite: undetermined by these data, or a division by zero"
 UNDEFINED = "undefined: there is nothing to compute it from"
 
 _PLAIN = frozenset({type(None), bool, int, str})

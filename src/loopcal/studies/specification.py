@@ -65,10 +65,10 @@ class InstrumentLevel(Limited):
     kinds : kinds of measurement. components : coordinates that the kind `component` measures.
     orientation : form of measured angles. sigma_position, sigma_angle : standard deviation of each
         length and each angle, by default 10 um and 50 urad.
-    unknown_frames : which of "base" and "tool" the fit estimates. distribution : of the noise; a
-        sigma is its standard deviation in both, so uniform noise lies within sqrt(3) of it.
-    unused : measured columns that the fit does not get, such as psi. The noise of the others is the
-        same as without it, so that two such instruments are compared on the same measurements.
+    unknown_frames : which of "base" and "tool" the fit estimates. distribution : of the noise. A
+        sigma is its standard deviation, so uniform noise lies within sqrt(3) of it.
+    unused : measured columns that the fit does not get, such as psi. The noise of the others is as
+        without it, so a study compares such instruments on equal measurements.
     """
 
     LIMITS: ClassVar[Mapping[str, Limit]] = {
@@ -103,12 +103,12 @@ class PosesLevel(Limited):
     count : number of poses. choice : "random" draws them evenly from the workspace, "planned" plans
         them for the robot and the instrument, "tilts" puts them on three rings of equal tilt,
         "plane-line" on planes and perpendicular lines for an instrument of the kinds plane and
-        line. seed : of the draw or the plan; by
-        default that of the study. Every trial of a cell measures the same poses.
-    groups : planes with a line each, for "plane-line"; count is the number of all their points.
-    axis : along which their lines run. sweeps : of the coordinate exchange that improves the
-        points; 0 leaves them as drawn.
-    file : CSV file of poses beside the study file, in place of these settings.
+        line. seed : of the draw or the plan (default: of the study). Every trial of a cell measures
+        these poses.
+    groups : planes with a line each, for "plane-line". count is the number of all their points.
+    axis : along which their lines run. sweeps : of the coordinate exchange that improves the points
+        (0: as drawn).
+    file : CSV file of poses next to the study file, in place of these settings.
     coordinates : (n, c) controlled coordinates [m, rad] of that file.
     """
 
@@ -145,18 +145,18 @@ class PosesLevel(Limited):
 
 @dataclass(frozen=True)
 class ErrorsLevel(Limited):
-    """The errors of the true machines, and the tolerances that the fit states for them.
+    """The errors of the true machines, and their tolerances in the fit.
 
     Parameters
     ----------
     tolerance_factor : on the tolerances, which the fit knows.
     error_factor : true errors over tolerances, which the fit does not know.
-    distribution : of the errors; a tolerance is their standard deviation in both. Uniform errors
+    distribution : of the errors. A tolerance is their standard deviation in both. Uniform errors
         lie within sqrt(3) of it.
-    smallest : smallest size of a uniform error as a share of its largest; the tolerance stays its
-        standard deviation.
+    smallest : smallest size of a uniform error as a share of its largest (the tolerance stays its
+        standard deviation).
     tolerances : other tolerances by name of a parameter or by pattern, such as `leg*.length`.
-    deviations : the same true deviations from nominal in all trials, by name or pattern; other
+    deviations : equal true deviations from nominal in all trials, by name or pattern. Other
         parameters are nominal.
     """
 
@@ -187,15 +187,15 @@ class ErrorsLevel(Limited):
 
 @dataclass(frozen=True)
 class MethodLevel(Limited):
-    """How the parameters are estimated.
+    """Estimation of the parameters.
 
     Parameters
     ----------
     method : "auto" is the default of `identify`, see `loopcal.estimate.methods`. "per-leg"
         identifies a hexapod leg by leg from full poses, as a published study does.
     lam : weight of the penalty of ridge, or one by name or pattern of parameters, such as `{"*":
-        0.01, "*.length": 1}`, see `Ridge.resolve`. keep : directions of truncated-svd. Both are
-        chosen by cross-validation where they are not stated.
+        0.01, "*.length": 1}`, see `Ridge.resolve`. keep : directions of truncated-svd. Without
+        them cross-validation chooses both.
     loss, noise : as in `FitOptions`.
     rows : "raw" gives all rows and parameters the weight one in millimeters and radians, takes full
         steps and filters the step, as published studies do; least-squares then has no rank
@@ -205,7 +205,7 @@ class MethodLevel(Limited):
         with their own variances. For comparisons.
     epsilon : limit at which raw and per-leg fits end: of the largest component of a step [mm, rad]
         for raw fits (1e-6 by default), of what `stop` names for per-leg. steps : of these fits, at
-        most; without epsilon, exactly (3 by default for per-leg).
+        most, or without epsilon exactly (3 by default for per-leg).
     stop : what epsilon limits of per-leg: "dQint", the default, is the largest error of a pose
         after a step, position [mm] plus angle [rad]; "step" the largest component of a step.
     """
@@ -280,7 +280,7 @@ class MethodLevel(Limited):
             return
         what = "the method per-leg" if self.method == PER_LEG else f"'rows: {self.rows}'"
         if self.loss != NO_LOSS or self.noise != "given":
-            raise ValueError(f"{what} has no loss and no estimated noise. Remove them")
+            raise ValueError(f"{what} has neither loss nor estimated noise. Remove them")
         if self.method == PER_LEG and self.rows != "weighted":
             raise ValueError("the rows of per-leg are raw ones always. Remove 'rows'")
         for needed in ("lam", "keep"):
@@ -296,7 +296,7 @@ class MethodLevel(Limited):
 class Outliers(Limited):
     """`share` of the rows lie `size` sigmas off, in a random direction.
 
-    It is rounded to whole rows; where that is none, one row is off in as many of the trials.
+    It means whole rows. If that is none, one row is off in as many of the trials.
     """
 
     LIMITS: ClassVar[Mapping[str, Limit]] = {
@@ -308,12 +308,12 @@ class Outliers(Limited):
 
 @dataclass(frozen=True)
 class ThermalGrowth:
-    """The machine's lengths grow while it is measured.
+    """The machine's lengths grow during the measurement.
 
     Parameters
     ----------
-    expansion : of lengths, per kelvin. rise : temperature of the last pose over that of the first
-        [K]; it rises linearly, and the mean is that of the nominal machine.
+    expansion : of lengths, per kelvin. rise : temperature of the last pose over the first [K]. It
+        rises linearly, with the mean of the nominal machine.
     """
 
     expansion: float = 11.5e-6
@@ -336,8 +336,9 @@ class EffectsLevel(Limited):
 
     Parameters
     ----------
-    noise : true over stated sigma. degrees : of Student's t noise; by default the distribution of
-        the instrument. correlation : of the noise of a row with that of the row before.
+    noise : true sigma over the sigma of the fit. degrees : of Student's t noise (default: the
+        distribution of the instrument). correlation : of the noise of a row with the noise of the
+        row before.
     outliers : rows far off. drift : displacement of the instrument from the first to the last pose.
         jump : its displacement half-way. thermal, backlash : of the machine.
     """
@@ -359,13 +360,12 @@ class EffectsLevel(Limited):
 
 @dataclass(frozen=True)
 class Scores(Limited):
-    """What is computed of every trial.
+    """Results of every trial.
 
     Parameters
     ----------
-    held_out : number of poses at which the errors are computed; they are drawn from the workspace
-        and are not measured. frame : in which the errors are stated, "fitted" or "base"; "both"
-        states the fitted ones, and those in the base frame as further scores.
+    held_out : number of poses for the errors, drawn from the workspace and not measured. frame : of
+        the errors, "fitted" or "base", or "both": also errors in the base frame as further scores.
     intervals : "stated" computes them from the stated noise, for all trials of a block at once.
         "adjusted" computes them as a calibration does, which also uses what the residuals say about
         the noise; trials are then fitted one by one, which takes longer.
@@ -401,7 +401,7 @@ class Question(Limited):
     Parameters
     ----------
     factor : name of the factor, such as "poses" or "noise". score : name of a score, such as
-        "position". limit : of the score, with its unit where it has one. share : of the machines.
+        "position". limit : of the score, with its unit if it has one. share : of the machines.
     wanted : "smallest" or "largest" level that reaches it.
     """
 
@@ -582,8 +582,8 @@ def check_question(study: Study, question: Question) -> float:
     if len(chains) > 1 and all(len(chain.levels) == 1 for chain in chains):
         named = ", ".join(chain.levels[0] for chain in chains)
         raise DataError(
-            f"factor is {question.factor!r}, whose levels ({named}) have no order, so none is the "
-            f"{question.wanted}; ask for a factor whose levels differ in a number"
+            f"factor is {question.factor!r}, whose levels ({named}) have no order to find the "
+            f"{question.wanted}. Ask for a factor whose levels differ in a number"
         )
     columns = {
         column.name: column
@@ -820,7 +820,7 @@ def _compare(old: dict[str, Any], new: dict[str, Any]) -> Iterator[str]:
             continue
         if key == "replicates":
             if after < before:
-                yield f"replicates: {before} -> {after} (more are allowed, but not fewer)"
+                yield f"replicates: {before} -> {after} (allowed: more)"
         elif key in FACTORS:
             for level in before:
                 if level not in after:

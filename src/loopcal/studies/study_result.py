@@ -482,7 +482,7 @@ def read_status(folder: Path) -> StudyStatus:
 
 def view_status(state: StudyStatus, format_duration: Callable[[float], str]) -> list[Block]:
     """Return the page of a state."""
-    running = "it is being computed now" if state.is_running else "no driver is running"
+    running = "computation continues" if state.is_running else "no driver is running"
     page: list[Block] = [
         f"{state.title}: {state.blocks} of {state.total} blocks, {state.trials} trials; {running}"
     ]
@@ -814,10 +814,10 @@ SUMMARY_NOTE = (
     "intervals by the number of trials. Shares of coverage should be 0.95."
 )
 FRAMES = {
-    "fitted": "Pose errors are stated without motions of frames that the measurements do not fix.",
+    "fitted": "Pose errors exclude motions of frames that the measurements leave open.",
     "base": "Pose errors are in the base frame.",
-    "both": "Pose errors are stated without motions of frames that the measurements do not fix; "
-    "those whose names contain 'base' are in the base frame.",
+    "both": "Pose errors exclude motions of frames that the measurements leave open. Errors "
+    "whose names contain 'base' are in the base frame.",
 }
 """Frame of the scores of a study -> what the page says about it."""
 

@@ -170,8 +170,8 @@ def draw_score(
     groups = layout.group(summary.cells)
     if len(groups) > MOST_PANELS:
         raise DataError(
-            f"the figure of {score} would have {len(groups)} panels, but at most {MOST_PANELS} are "
-            "drawn. Draw it from summary.csv"
+            f"the figure of {score} would have {len(groups)} panels. Allowed: at most "
+            f"{MOST_PANELS}. Draw it from summary.csv"
         )
     column = study.columns[place]
     levels = dict.fromkeys(layout.find_level(cell, layout.color) for cell in summary.cells)

@@ -84,7 +84,11 @@ def test_a_configuration_of_several_files_is_corrected(tmp_path, robots) -> None
         ("a.cfg", "[printer]\nkinematics: polar\n", "form no closed loop"),
         ("a.cfg", "[printer]\nkinematics: corexy\n", "shipped robot 'core-xy'"),
         ("a.g", "M669 K0\n", "'cartesian'"),
-        ("a.g", "M669 K6 N4 A0:1 B1:1:1 C1:1:1 D0:0:2\n", "A of M669 has 2 numbers, but 3 are"),
+        (
+            "a.g",
+            "M669 K6 N4 A0:1 B1:1:1 C1:1:1 D0:0:2\n",
+            "A of M669 has 2 numbers, but must have 3",
+        ),
         ("a.g", "M669 K6 N9\n", "Write a number of 3 to 8 lines"),
     ],
 )

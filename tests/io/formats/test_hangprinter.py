@@ -185,7 +185,7 @@ def test_keys_that_are_not_read_are_reported(tmp_path) -> None:
         ({"mechanical_advantage": [2, 2, 2, 0]}, "Write positive numbers"),
         ({"spool_gear_teeth": "many"}, "'spool_gear_teeth' is not a number"),
         ({"anchors": [[1, 2, 3]]}, "'anchors' has 1 rows, but there are 4 lines"),
-        ({"xyz_of_samp": []}, "no pose is known. Add known poses"),
+        ({"xyz_of_samp": []}, "the samples give no pose. Add known poses"),
         ({"xyz_of_samp": [[0, 0, 0]]}, "the 1 known poses do not determine the anchor of line A"),
         *(({TAPED: lengths}, "must be a list of 4 lengths in mm") for lengths in WRONG_LENGTHS),
         *(({TAPED: [v, 1, 1, 1]}, "is not finite") for v in (float("inf"), float("nan"))),

@@ -87,4 +87,4 @@ def test_damaged_files_are_refused(config, log, words, capsys) -> None:
 
 def test_another_robot_is_not_written_as_a_maslow(capsys) -> None:
     assert main(["export", "linear-delta", "--format", "maslow"]) == 1
-    assert "has no bl.anchor.x" in capsys.readouterr().err
+    assert "lacks bl.anchor.x" in capsys.readouterr().err

@@ -157,14 +157,22 @@ REFUSED = [
     ("reprap", "M665 R1 H2\n", "M665 has no L"),
     ("reprap", "G20\nM665 L2 R1 H2\n", ":1: G20 selects inches"),
     ("reprap", "G28\nM665 L2:2:2:2 R1 H2\n", ":2: L of M665 has 4 lengths"),
-    ("reprap", "M665 L250 R130 H2-3\n", ":1: H of M665 is '2-3', but a finite number is needed"),
+    ("reprap", "M665 L250 R130 H2-3\n", ":1: H of M665 is '2-3', but must be a finite number"),
     ("reprap", "M665 L250 R130 H200\nM666 A0.3\n", ":2: M666 A tilts the bed"),
     ("reprap", "M665 L100 R130 H200\n", "the delta radius is 130 mm and the shortest arm 100 mm"),
-    ("reprap", "G28\nM665 L269 R130,25 H250\n", ":2: R of M665 is '130,25', but a finite number"),
+    (
+        "reprap",
+        "G28\nM665 L269 R130,25 H250\n",
+        ":2: R of M665 is '130,25', but must be a finite number",
+    ),
     ("reprap", "M665 L269 R130 ,25 H250\n", ":1: M665 has ',25 H250', but a letter and its number"),
     ("reprap", "M665 269 R130 H250\n", ":1: M665 has '269 R130 H250', but a letter"),
     ("reprap", "M665 L269 R130 H250\nM666 X - 0.5\n", ":2: M666 has '0.5', but a letter"),
-    ("reprap", "M665 L{var.rod} R130 H250\n", ":1: L of M665 is '{var.rod}', but a finite number"),
+    (
+        "reprap",
+        "M665 L{var.rod} R130 H250\n",
+        ":1: L of M665 is '{var.rod}', but must be a finite number",
+    ),
     ("reprap", "M665 L269 R130 R131 H250\n", ":1: M665 has R twice"),
     ("reprap", "G28 G20\nM665 L269 R130 H250\n", ":1: G20 selects inches"),
     ("marlin", "M665 L250 R130 H200 B80\n", ":1: M665 B without A and C"),
@@ -178,7 +186,11 @@ CHANGES = [
     ("kinematics: delta", "kinematics: corexy", "its kinematics is 'corexy'"),
     ("delta_radius: 130", "", "option 'delta_radius' of [printer] is missing"),
     ("delta_radius: 130", "[include geometry.cfg]", "if geometry.cfg contains it"),
-    ("endstop: 300", "endstop: high", ":6: 'position_endstop' of [stepper_a] is 'high', but a"),
+    (
+        "endstop: 300",
+        "endstop: high",
+        ":6: 'position_endstop' of [stepper_a] is 'high', but must be a",
+    ),
     ("position_endstop: 300", "position_endstop: inf", ":6: "),
     ("arm_length = 250", "arm_length = 120", "delta radius is 130 mm and the shortest arm 120 mm"),
     ("[stepper_c]\n", "[delta_calibrate]\nheight0: 0\nheight0_pos: 1,2\n", ":12: 'height0_pos' "),
@@ -202,7 +214,7 @@ REFUSED += [
     (
         "linuxcnc",
         re.sub(r"(base\.0\.y) \S+", r"\1 [HEX]B0Y", GENHEX),
-        "genhexkins.base.0.y is '[HEX]B0Y', but a finite number",
+        "genhexkins.base.0.y is '[HEX]B0Y', but must be a finite number",
     ),
 ]
 

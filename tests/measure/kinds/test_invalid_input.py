@@ -93,7 +93,7 @@ REFUSED = {
     "the components are z, z. Name .* each once": lambda: Component(("z", "z")),
     "the components are empty. Name at least one": lambda: Component(()),
     "phi needs theta": lambda: Component(("phi",), "tilt-torsion"),
-    "components of a rotation-vector cannot be": lambda: Component(("x",), "rotation-vector"),
+    "a rotation-vector has no single components": lambda: Component(("x",), "rotation-vector"),
     "is not one of the 24": lambda: Component(("a",), "euler-xxy"),
     "orientation form 'rpy'. Use rotation-vector, quaternion, tilt-torsion, or euler-": (
         lambda: Component(("a",), "rpy")
@@ -111,7 +111,7 @@ REFUSED = {
     "the joints are empty. Name at least one": lambda: JointSensor(joints=()),
     "the joints measure 'force'. Use length or angle": lambda: JointSensor(measures="force"),
     # values of rows
-    "row 2 of kind 'distance' has a distance of 0 m; a distance is above 0": (
+    "row 2 of kind 'distance' has a distance of 0 m. A distance is above 0": (
         lambda: observe([1.0], [0.0], kind=Distance(places=POINT))
     ),
     "has a distance of -0.1 m": lambda: observe([1.0], [-0.1], kind=BAR, poses=[[0, 1], [1, 0]]),
@@ -127,7 +127,7 @@ REFUSED = {
     "has a quaternion of length 0; the length must be 1": (
         lambda: observe([0.0] * 7, kind=Pose("quaternion", T_platform_tool=np.eye(4)))
     ),
-    "row 2 .* b = 90 deg, where a and c of euler-xyz are the same rotation": lambda: observe(
+    "row 2 .* b = 90 deg, at which a and c of euler-xyz are one rotation": lambda: observe(
         [0.1, 0.2],
         [0.1, np.pi / 2],
         kind=Component(("a", "b"), "euler-xyz", T_platform_tool=np.eye(4)),

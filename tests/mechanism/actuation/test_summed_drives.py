@@ -517,7 +517,7 @@ SECOND, THIRD = "q2: {reads: length, sum: {m: 1, k: 2}}", "q3: {reads: length, s
         (SECOND, "q2: {reads: length, sum: {m: 0, k: 0}}", "no weight other than 0", 9),
         (SECOND, "q2: {reads: length, sum: {m: 1, k: .inf}}", "is inf. Write a finite number", 9),
         (SECOND, "q2: {reads: length, sum: [m, k]}",
-         "'actuators.q2.sum' is a list of 2, but a mapping is needed", 9),
+         "'actuators.q2.sum' is a list of 2, but must be a mapping", 9),
         (SECOND, "q2: {reads: lenght, sum: {m: 1, k: 2}}",
          "'lenght' .did you mean 'length'... Allowed: 'length', 'angle'", 9),
         (SECOND, "q2: {reads: length}", "'q2' drives no joint", 9),

@@ -136,7 +136,7 @@ def test_incomplete_search_for_modes_is_refused():
 
 
 def test_wrong_number_of_readings_is_refused_for_assembly_modes():
-    with pytest.raises(DataError, match="3 readings were given"):
+    with pytest.raises(DataError, match="3 readings do not fit"):
         find_assembly_modes(zoo.hexapod(), np.zeros(3))
 
 

@@ -156,7 +156,7 @@ def test_sampled_tilt_is_uniform_over_the_spherical_cap():
 def test_empty_workspace_is_refused_with_its_reason():
     robot = build_delta_with_workspace({"x": (5.0, 6.0), "y": (-0.08, 0.08), "z": (0.0, 0.2)})
     with pytest.raises(
-        MechanismError, match=r"almost nothing .*: 0 of .* reason: the loops cannot be closed"
+        MechanismError, match=r"almost nothing .*: 0 of .* reason: the loops do not close"
     ):
         sample_workspace(robot, 10)
     robot = build_delta_with_workspace(
@@ -175,7 +175,7 @@ def test_workspace_is_refused_where_drawing_from_it_would_take_long(share, is_re
     if not is_refused:
         assert sample_workspace(robot, 200).reachable_share == pytest.approx(share, rel=0.3)
         return
-    with pytest.raises(MechanismError, match=r"of 2000 .*at least 1% are needed"):
+    with pytest.raises(MechanismError, match=r"of 2000 .*at least 1% needed"):
         sample_workspace(robot, 200)
 
 

@@ -135,7 +135,7 @@ REFUSED = {
     "ru-pus-prs": ("drives: {q1: {reads: angle}}", "actuator 'q1' drives a joint that slides"),
     "arm-6r": (
         "drives: {j2: {reads: angle, unknown: [sin1], angle: {sd: 0.1}}}",
-        "actuator 'j2' states sin1, but no period",
+        "actuator 'j2' has sin1, but no period",
     ),
     "hexapod-nategh-agheli": (
         "drives: {q: {reads: length, table: [[0, 0], [1, -2], [5, 0]]}}",

@@ -290,7 +290,7 @@ INVALID_RECORDS = {
     ),
     "no period": (
         replace(SLIDER, drives={"q": LengthDrive(reads="length", unknown=("sin1",))}),
-        "states sin1, but no period",
+        "has sin1, but no period",
     ),
     "no such element": (
         change_limb(errors=(Shifts("hinge", ("x",)),)),
@@ -302,7 +302,7 @@ INVALID_RECORDS = {
     ),
     "rod of a ball": (
         change_limb(ending="ball"),
-        "ends ball and states a length, drive or cone of a rod",
+        "ends ball and has a length, drive or cone of a rod",
     ),
     "tilt alone": (
         change_limb(
@@ -321,7 +321,7 @@ INVALID_RECORDS = {
     ),
     "unknown owner": (
         replace(SLIDER, parameters=(NamedLength("r", 0.1, (MapEntry("arm", "P1", "x"),)),)),
-        "'r' is mapped onto 'arm', which is not there. Known: rod, q1, q2",
+        "'r' maps onto 'arm', which does not exist. Known: rod, q1, q2",
     ),
 }
 
@@ -464,8 +464,8 @@ INVALID_VALUES = {
     "drive mistyped": (
         ("actuated: q", "actuated: w"),
         (
-            "actuator 'q' drives no joint. Write 'actuated: q' at one, or leave it out; joints are "
-            "driven by w1, w2, w3"
+            "actuator 'q' drives no joint. Write 'actuated: q' at one, or leave it out. "
+            "w1, w2, w3 drive joints"
         ),
     ),
 }
@@ -482,7 +482,7 @@ def test_misspelled_actuator_is_reported_before_missing_parameters(tmp_path: Pat
     start, end = text.index("    errors:"), text.index("home:")
     path = tmp_path / "silent.yaml"
     path.write_text(text[:start] + text[end:])
-    with pytest.raises(LoopcalError, match="joints are driven by w1, w2, w3"):
+    with pytest.raises(LoopcalError, match="w1, w2, w3 drive joints"):
         load_robot(path)
 
 
@@ -541,7 +541,7 @@ MAPS = {
     ),
     "pitch": (
         ("length", ON_ARM + "pitch"),
-        "parameter 'p' is mapped onto 'pitch'. Use lead, the advance in one turn",
+        "parameter 'p' maps onto 'pitch'. Use lead, the advance in one turn",
     ),
 }
 

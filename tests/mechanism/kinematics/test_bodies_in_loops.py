@@ -375,8 +375,8 @@ def test_frame_of_a_body_is_no_unknown_of_the_complete_model(tmp_path: Path) -> 
     [
         ("on: arm, -> on: arm7,", "'arm7', which is not a body \\(did you mean"),
         ("on: arm, -> on: arm, to: arm,", "limb 'rod1' begins and ends on 'arm1'"),
-        ("bodies: -> bodies:\n  - {name: base}", "two bodies are called 'base'"),
-        ("bodies: -> bodies:\n  - {name: arm2}", "two bodies are called 'arm2'"),
+        ("bodies: -> bodies:\n  - {name: base}", "two bodies have the name 'base'"),
+        ("bodies: -> bodies:\n  - {name: arm2}", "two bodies have the name 'arm2'"),
         ("bodies: -> bodies:\n  - {name: idler}", "no limb joins the body 'idler'"),
         (f"limbs: -> {IDLER.replace('chain', 'tip: [0, 0, 0], chain')}", "'idler' can move while"),
         (f"limbs: -> {IDLER.replace('rigid', 'ball')}", "'idler' has no rigid limb from a body wi"),

@@ -130,12 +130,11 @@ def test_every_kinematics_status_is_in_the_catalog_of_findings():
 
 def test_wrong_shapes_of_readings_and_targets_are_refused():
     with pytest.raises(
-        DataError, match=r"5 readings a row were given, but hexapod has 6 actuators \(q1, q2"
+        DataError, match=r"5 readings a row do not fit: hexapod has 6 actuators \(q1, q2"
     ):
         forward(zoo.hexapod(), np.zeros((2, 5)))
     with pytest.raises(
-        DataError,
-        match=r"a target of shape \(2, 5\) was given. Allowed: \(n, 4, 4\) poses or \(n, 3\)",
+        DataError, match=r"a target has the shape \(2, 5\). Allowed: \(n, 4, 4\) poses or \(n, 3\)"
     ):
         inverse(zoo.delta(), np.zeros((2, 5)))
 

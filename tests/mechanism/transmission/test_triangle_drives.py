@@ -321,7 +321,7 @@ def sample_or_home(robot: Mechanism) -> Array:
         ("[offset, gain", "[offset, fot.x, gain", "no term 'fot.x'"),
         ("[offset, gain", "[offset, foot.w, gain", "no term 'foot.w'"),
         ("[offset, gain", "[offset, skew.ry, gain", "about the joint's own axis"),
-        ("start: -45", "start: -45\n      stroke: [0, 1]", "states 'stroke' beside the triangle"),
+        ("start: -45", "start: -45\n      stroke: [0, 1]", "has 'stroke' besides the triangle"),
         ("start: -45", "start: -45\n      errors: [offset]", "errors: \\[offset\\]' beside"),
         ("kind: R", "kind: P", "'kind' is 'P'|kind' is 'P'"),
         ("gain: 0.98", "gain: 0.98\n        reads: angle", "reads"),

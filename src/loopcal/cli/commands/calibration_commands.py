@@ -66,15 +66,15 @@ def calibrate(
 
     DATA may be several files, joined by the names of poses.
 
-    The verdict is one of
+    Verdicts:
       calibrated                    use the result
       calibrated with reservations  usable, with a warning that affects accuracy
       undecided                     no held-out poses, or too few
-      not calibrated                exit code 2. The run folder is still written, but its robot
-                                    file is called robot-not-calibrated.yaml
+      not calibrated                exit code 2. The run folder then has a robot file
+                                    with the name robot-not-calibrated.yaml
 
-    "Not calibrated" means that the fit did not converge, the residuals contradict the given noise,
-    errors on held-out poses grew, or a limit is exceeded.
+    "Not calibrated" means: the fit failed to converge, the residuals contradict the given noise,
+    errors on held-out poses grew, or an error exceeds its limit.
 
     Examples:
       loopcal calibrate hexapod-42 measurements.csv --hold-out 0.25
@@ -178,7 +178,7 @@ def accuracy(
     calibrated = lc.load_run(run)
     posterior = calibrated.load_stated_errors()
     region = opt.read_volume(volume, posterior.robot)
-    assert region is not None, "the option is required"
+    assert region is not None, "click requires the option"
     stated = lc.bound_errors(posterior, region, frame, limit=limit_position)
     return Output(stated, lambda: str(stated).splitlines(), stated.failures)
 
@@ -203,7 +203,7 @@ def validate(
     A run has errors before and after calibration, a robot file without identified values only one.
     The noise floor is the error that the measurement noise alone causes.
 
-    Frames, targets and surfaces keep their values in RUN, by name. Others are fitted to DATA: the
+    Frames, targets and surfaces keep their values in RUN, by name. DATA determine others: the
     errors are then optimistic, as a note says.
 
     Above a limit the exit code is 2.
@@ -362,7 +362,7 @@ def compare(
 
     The first RUN is the reference of the others. For independent data, a test shows whether the
     machine has changed, and names the parameter or limb that explains it. The false-alarm rate is 5
-    % for all runs together. Runs that share measurements are compared without a test.
+    % for all runs together. Runs that share measurements get no test.
 
     All runs must have one mechanism, with equal free parameters and fixed values.
 
@@ -418,7 +418,7 @@ def repeatability(
 def report(
     run: Path = opt.RUN,
     output: Path = opt.path(
-        "HTML file to write, with a name in .html. A JSON file with equal content is written next "
+        "HTML file to write, with a name in .html. A JSON file with equal content appears next "
         "to it. Default: report.html.",
         "-o",
         default=Path("report.html"),
@@ -480,8 +480,8 @@ def regularize(
     force: bool = opt.force("the folder"),
     allowed: dict[str, bool] = opt.ALLOWED,
 ) -> Output:
-    """Show how the error at held-out poses of DATA depends on the ridge parameter lam and on the
-    number k of directions of truncated SVD, with the values that the rules choose.
+    """Show how the error at held-out poses of DATA depends on the ridge parameter lam and the
+    number k of directions of truncated SVD, and the values that the rules choose.
 
     Use a chosen value with loopcal calibrate --method ridge --lam, or --method truncated-svd
     --keep.

@@ -185,9 +185,9 @@ def convert_instrument_export(
         "findings": converted.findings,
     }
     page = [
-        f"{output}: {converted.rows} rows; {converted.passed} lines skipped by the profile",
+        f"{output}: {converted.rows} rows, {converted.passed} lines skipped by the profile",
         *(f"note: {with_hint(finding)}" for finding in converted.findings),
-        *_note_misfits([(file, *misfit) for misfit in converted.misfits], f"; {output} lists them"),
+        *_note_misfits([(file, *misfit) for misfit in converted.misfits], f", listed in {output}"),
     ]
     return Output(document, lambda: page)
 
@@ -399,7 +399,7 @@ def _view_import(
     if document["corrected"] is None:
         files = document["robot"], document["data"] or "DATA"
         return [*page, suggest_command("calibrate", *files, "-o", "run")]
-    return [*page, f"Written to {document['corrected']}. The rest of the file is unchanged"]
+    return [*page, f"Written to {document['corrected']}. Its other lines are as before"]
 
 
 @opt.command()
@@ -437,8 +437,8 @@ def export(
     The formats grid, grid-klipper, grid-reprap and grid-linuxcnc are tables of corrections for a
     controller that keeps its geometry. A note states the error that remains between nodes.
 
-    Without -o, the command prints lines to type: each identified value has three digits of its
-    uncertainty, and at most the decimals that the controller keeps. Files have all digits. A note
+    Without -o, the command prints lines to type: each identified value with three digits of its
+    uncertainty, at most the decimals that the controller keeps. Files have all digits. A note
     names what the format cannot express. If the calibration of RUN failed, the exit code is 2, and
     only --force writes files.
 

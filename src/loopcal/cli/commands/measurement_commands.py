@@ -163,7 +163,7 @@ def simulate(
     Default of --poses: drawn evenly from the workspace of ROBOT. The true machine has the
     identified values of ROBOT, or drawn ones with --draw-errors.
 
-    Targets on the base (`of: base` in the settings of a file) need --fill: name the sheet that
+    Targets on the base (`of: base` in the settings of a file) need --fill with the sheet that
     `loopcal plan --like` wrote from such a file.
 
     Examples:
@@ -210,8 +210,8 @@ def simulate(
     if result.skipped:
         skipped, names = len(result.skipped), ", ".join(result.skipped)
         page.append(
-            f"{skipped} of {skipped + n_poses} poses are outside its reach or strokes and are "
-            f"skipped: {names}"
+            f"{skipped} of {skipped + n_poses} poses are outside its reach or strokes, "
+            f"so loopcal skips them: {names}"
         )
     return Output(document, lambda: page)
 

@@ -128,9 +128,7 @@ def plan(
     machine = lc.load_robot(robot).with_conditions(dict(at))
     if unknown["measure"] == (PLANE_LINE,):
         for name, reason in EXCLUDED_BY_PLANE_LINE.items():
-            sentence = (
-                "{option} cannot be combined with --measure plane-line, {reason}. Leave it out"
-            )
+            sentence = "--measure plane-line takes no {option}, {reason}. Leave it out"
             opt.refuse_given((name,), reason, sentence)
         sigma = instrument["sigma_position"]
         surface_options = lc.SurfaceOptions(groups, points, sigma, constraints, seed)

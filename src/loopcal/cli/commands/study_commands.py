@@ -142,8 +142,8 @@ def new(
 ) -> Output:
     """Write a study file to fill in, with a comment for each setting.
 
-    With --paper, write the study of a paper: its errors, noises and methods. --robot replaces its
-    robot, and the command lists the sizes that change with it.
+    With --paper, write the study of a paper: its errors, noises and methods. With --robot,
+    replace its robot, and list the sizes that change with it.
 
     Examples:
       loopcal study new study.yaml

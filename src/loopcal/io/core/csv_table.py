@@ -221,7 +221,7 @@ class Table:
         if len(beyond):
             row = int(beyond[0])
             allowed = f"{LARGEST / factor:g} [{self.units[name]}]"
-            sentence = f"column {name!r} is {self.text(name)[row]}, beyond {allowed}"
+            sentence = f"column {name!r} is {self.text(name)[row]}, outside {allowed}"
             raise self.row_error(row, f"{sentence}. Correct the number or the unit")
         return values
 
@@ -258,10 +258,10 @@ class Table:
         if not cell:
             return self.row_error(row, f"column {name!r} is empty, but required. Write its value")
         if parse_number(cell) is None:
-            sentence = f"column {name!r} is {quote(cell)}, but a number is needed"
+            sentence = f"column {name!r} is {quote(cell)}, but must be a number"
             return self.row_error(row, f"{sentence}, such as 12.5 or 1e-3")
         sentence = f"column {name!r} is {quote(cell)}, which is not finite"
-        return self.row_error(row, f"{sentence}. Leave the cell empty if nothing was measured")
+        return self.row_error(row, f"{sentence}. Leave the cell empty if you measured nothing")
 
     def header_error(self, sentence: str) -> FileError:
         """Return an error at the header line."""
@@ -330,7 +330,7 @@ def read_template(path: str | Path) -> Table:
     TABLE_COLUMNS.check(header.count(",") + 1, WHAT, path, header_line)
     if "," not in header and (";" in header or "\t" in header):
         separator = "semicolons" if ";" in header else "tabs"
-        sentence = f"columns are separated by {separator}. Use commas, and decimal points"
+        sentence = f"{separator} separate the columns. Use commas, and decimal points"
         raise FileError(sentence + CONVERT_HINT, path, header_line)
     units = _parse_header(path, header_line, header)
     blocks = []

@@ -108,7 +108,7 @@ LIMBS = FileLimit("limbs of a robot", MOST_LIMBS, "limbs", "copies included")
 JOINTS = FileLimit("joints of a limb", MOST_JOINTS, "joints", "a universal joint counts as two")
 ACTUATORS = FileLimit("actuators of a robot", MOST_ACTUATORS, "actuators", "of all limbs together")
 PARAMETERS = FileLimit(
-    "parameters of a robot", MOST_PARAMETERS, "parameters", "those that are fixed included"
+    "parameters of a robot", MOST_PARAMETERS, "parameters", "including fixed ones"
 )
 NAME_LENGTH = FileLimit(
     "length of a name",
@@ -146,7 +146,7 @@ TABLE_LINES = FileLimit(
     5_000_000,
     "lines",
     "blank lines and remarks included",
-    "remove what is not a row, or divide it into several files",
+    "remove other lines, or divide it into several files",
 )
 TABLE_COLUMNS = FileLimit(
     "columns of a measurement file",
@@ -187,7 +187,7 @@ PROGRAM_SIZE = FileLimit(
     5,
     "MB",
     "files that `loopcal import` and `loopcal export` read",
-    "check that this is the file that was meant, or remove what does not belong there",
+    "check that this is the right file, or remove other content",
 )
 JSON_VALUES = FileLimit(
     "values in JSON text",

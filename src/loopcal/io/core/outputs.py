@@ -67,9 +67,7 @@ def refuse_outputs(
         if any(_is_same_file(path, other) for other in wanted[:i]):
             raise FileError("two outputs have this name. Choose another name for one of them", path)
         if not folder.is_dir():
-            raise FileError(
-                f"cannot write here: folder {folder} does not exist; create it first", path
-            )
+            raise FileError(f"folder {folder} does not exist. Create it first", path)
         if not os.access(folder, os.W_OK):
             raise FileError("cannot write here (permission denied). Choose another folder", path)
         if path.is_file() and not force:
@@ -173,7 +171,7 @@ def refuse_folder(path: Path, kind: FolderKind, force: bool, inputs: Sequence[Pa
         _refuse_place(path, target)
         for file in inputs:
             if file.exists() and file.resolve().is_relative_to(target):
-                sentence = f"this folder contains the input {file} and cannot be replaced"
+                sentence = f"replacing this folder would remove the input {file}"
                 raise FileError(f"{sentence}. Choose another name", path)
         if target.is_dir() and any(target.iterdir()):
             if not force:
@@ -182,7 +180,7 @@ def refuse_folder(path: Path, kind: FolderKind, force: bool, inputs: Sequence[Pa
             _refuse_other_content(path, kind)
             places = (place for place, _, _ in os.walk(target))  # gone where another command writes
             if any(os.path.lexists(p) and not os.access(p, os.W_OK | os.X_OK) for p in places):
-                sentence = "this folder is protected against changes, so it cannot be replaced"
+                sentence = "this folder permits no changes"
                 raise FileError(f"{sentence}. Choose another name, or permit writing in it", path)
 
 

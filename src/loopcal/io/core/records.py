@@ -165,7 +165,7 @@ class _RecordReader:
         if arguments[1:] == (Ellipsis,):
             members = arguments[:1] * len(items)
         elif len(items) != len(members):
-            fact = f"{_name(at)} has {len(items)} values, but {len(members)} are needed"
+            fact = f"{_name(at)} has {len(items)} values, but must have {len(members)}"
             act = "Remove the others" if len(items) > len(members) else "Add the missing ones"
             raise _MisfitError(fact, f". {act}", at)
         pairs = enumerate(zip(members, items, strict=True))
@@ -292,11 +292,11 @@ def _require(needed: Any, node: Any, at: Location) -> Any:
     if isinstance(node, allowed) and (needed is bool or not isinstance(node, bool)):
         return float(node) if needed is float else node
     if needed is int and isinstance(node, float):
-        act = "Write it without a decimal point and without an exponent"
+        act = "Write it without decimal point or exponent"
     if needed in (float, int) and isinstance(node, str) and node.strip()[:1] in "+-.0123456789":
-        act = "Write the number without quotes and without a unit"
+        act = "Write the number without quotes or unit"
         act = "Write a decimal point, not a comma" if "," in node else act
-    raise _MisfitError(f"{_name(at)} is {_describe(node)}, but {words} is needed", f". {act}", at)
+    raise _MisfitError(f"{_name(at)} is {_describe(node)}, but must be {words}", f". {act}", at)
 
 
 def _name(location: Location) -> str:

@@ -431,7 +431,7 @@ def open_bytes(path: str | Path, what: str) -> Iterator[BufferedReader]:
         ) from None
     except OSError as error:
         action = ACTIONS.get(error.errno or 0, "check the file, its path and its permissions")
-        raise FileError(f"this {what} cannot be read ({_reason(error)}); {action}", path) from error
+        raise FileError(f"cannot read this {what} ({_reason(error)}); {action}", path) from error
 
 
 def _open_ordinary_file(path: Path, what: str) -> int:
@@ -441,12 +441,12 @@ def _open_ordinary_file(path: Path, what: str) -> int:
     which may denote another file a moment later.
     """
     if path.is_dir():  # not every system opens a folder
-        raise FileError(f"this is a folder, but a {what} is needed. Name a file in it", path)
+        raise FileError(f"this is a folder, not a {what}. Name a file in it", path)
     descriptor = os.open(path, OPEN_FLAGS)
     if stat.S_ISREG(os.fstat(descriptor).st_mode):
         return descriptor
     os.close(descriptor)
-    sentence = f"this is a device or a pipe, but a {what} is needed. Save it as an ordinary file"
+    sentence = f"this is a device or a pipe, not a {what}. Save it as an ordinary file"
     raise FileError(f"{sentence} and name that", path)
 
 
@@ -526,7 +526,7 @@ def report_write_errors(path: str | Path) -> Iterator[None]:
     except OSError as error:
         folder = Path(path).parent
         if isinstance(error, FileNotFoundError) and not folder.is_dir():
-            sentence = f"cannot write here: folder {folder} does not exist; create it first"
+            sentence = f"folder {folder} does not exist. Create it first"
             raise FileError(sentence, path) from None
         raise FileError(
             f"cannot write here ({_reason(error)}). Choose another place", path

@@ -116,7 +116,7 @@ def _load_content(
     from ruamel.yaml.error import MarkedYAMLError, YAMLError
 
     if (directive := _DIRECTIVE.match(text)) is not None:
-        sentence = "YAML directives, which begin with %, are not allowed here. Remove the line"
+        sentence = "this file must not have YAML directives, which begin with %. Remove the line"
         raise FileError(sentence, path, directive[0].count("\n") + first_line)
     try:
         compose = _compose if len(text) <= KEPT_LENGTH else _compose.__wrapped__
@@ -225,7 +225,7 @@ class _NodeReader:
         # a tag that the file states is not the one of the form of the value
         form = (node.style is None, node.style is not None) if is_text else True
         if node.tag != str(self.yaml.resolver.resolve(type(node), node.value, form)):
-            raise _RefusedError("YAML tags are not allowed here. Remove the tag", line)
+            raise _RefusedError("this file must not have YAML tags. Remove the tag", line)
         if is_text:
             return self._read_scalar(node, at, line)
         if any(node is outer for outer in self.within):

@@ -214,9 +214,9 @@ class ContextColumn(Column):
         try:
             moment = datetime.fromisoformat(cell) if cell else None
         except ValueError:
-            sentence = f"column 'time' is {cell!r}, but a date and time is needed, such as"
-            act = "or give the column a unit, as 'time [s]'"
-            raise table.row_error(row, f"{sentence} 2026-05-04T10:22:31; {act}") from None
+            sentence = f"column 'time' is {cell!r}, but must be a date and time. Write"
+            act = "2026-05-04T10:22:31, or give the column a unit, as 'time [s]'"
+            raise table.row_error(row, f"{sentence} {act}") from None
         if moment is None:
             return math.nan
         return (moment if moment.tzinfo is not None else moment.replace(tzinfo=UTC)).timestamp()
@@ -356,7 +356,7 @@ RULES: tuple[ColumnRule, ...] = (
     ColumnRule(
         "COLUMN",
         "of the kind",
-        f"measured value; `{MEASURED}COLUMN` where a reading has the same name",
+        f"measured value, `{MEASURED}COLUMN` if a reading has an equal name",
         lambda robot, kinds: [
             _number(name_measured(c.name, robot), c.dimension)
             for kind in kinds

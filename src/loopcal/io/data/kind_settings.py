@@ -232,9 +232,7 @@ def _choose_form(
     """Return the key that states an uncertainty, its distribution, and its divisor."""
     forms = [name for name in FORMS if name in stated]
     if len(forms) != 1:
-        sentence = (
-            "an uncertainty is stated once: as 'sd', as 'limit' (uniform within it), or as 'U'"
-        )
+        sentence = "an uncertainty has one form: 'sd', 'limit' (uniform within it), or 'U'"
         raise file.error(f"{sentence} with its 'k'. Write one of them", place)
     form, k = forms[0], stated.get("k", 2.0)
     if not (isinstance(k, int | float) and 1.0 <= k <= MOST_K) or ("k" in stated and form != "U"):
@@ -249,7 +247,7 @@ def _state_size(text: Any, distribution: str = "normal", divisor: float = 1.0) -
     from loopcal.measure.observations import StatedSize
 
     match = NUMBER.match(text := str(text).strip())
-    assert match is not None, "the number was read before"
+    assert match is not None, "the reader has found the number"
     return StatedSize(float(match[0]), text[match.end() :].strip(), distribution, divisor)
 
 
@@ -403,7 +401,7 @@ def read_stated_values(
             if name in known and known[name][0] != value:
                 _, other, other_place = known[name]
                 line = f"{other.path}:{other.line(other_place)}"
-                sentence = f"parameter {name!r} is stated differently in {line}. Give it once"
+                sentence = f"parameter {name!r} differs from {line}. Give it once"
                 raise file.error(sentence, place)
         known = of_file | known
     common = [name for name, (value, _, _) in known.items() if value.scope == "all"]
@@ -522,7 +520,7 @@ def _read_one(
     if node == FIXED:
         return [StatedValue(entry.name) for entry in matching]
     if not isinstance(node, dict):
-        raise file.error(f"{node!r} does not state knowledge of a parameter; {EXAMPLE}", place)
+        raise file.error(f"{node!r} gives no knowledge of a parameter. {EXAMPLE}", place)
     dimensions = {entry.dimension for entry in matching}
     if len(dimensions) > 1 and ("start" in node or "sd" in node):
         sentence = "this pattern matches lengths and angles. Give them in separate lines"
@@ -530,7 +528,7 @@ def _read_one(
     stated = read_record(file, node, RECORDS[matching[0].dimension], None, place)
     is_only_shared = stated.scope == "all" and not stated.fixed and "sd" not in node
     if stated.fixed == ("sd" in node) and not is_only_shared:
-        raise file.error(f"state either 'sd' or '{FIXED}: true'; {EXAMPLE}", place)
+        raise file.error(f"give either 'sd' or '{FIXED}: true'. {EXAMPLE}", place)
     if "sd" in node and (fault := find_sd_fault(stated.sd or 0.0)):
         sentence = f"the standard deviation is {node['sd']}; {fault}, or {FIXED}"
         raise file.error(sentence, (*place, "sd"))
@@ -571,13 +569,13 @@ UNKNOWN, MPE = "unknown", "mpe"
 SHARED_ERRORS: Mapping[str, str] = {
     "session_bias": "`unknown`, or component -> standard deviation or `unknown`: an offset that "
     "all rows of a session share",
-    "session_drift": "the same for a change from the first to the last row of a session, linear "
-    "in time or, without the column `time`, in the order of the rows",
+    "session_drift": "as above, for a change over a session, linear in time or, without the column "
+    "`time`, in the order of the rows",
     "scale": "a factor on all measured lengths: `sd` of its deviation from 1, and, unless 0, its "
     "`mean`. With `scope: all` one factor holds in all sessions",
-    "temperature": "of the machine or part: `value`, `sd`, its `expansion` minus that of the "
-    "instrument's scale, and, unless 0, `expansion_sd`. Measured lengths are longer by `expansion "
-    "* (value - reference)`. `reference` is 20 degC, `scope` as of `scale`",
+    "temperature": "of the machine or part: `value`, `sd`, its `expansion` minus the scale's, and, "
+    "unless 0, `expansion_sd`. Measured lengths are longer by `expansion * (value - reference)`. "
+    "`reference` is 20 degC, `scope` as of `scale`",
     MPE: "maximum permissible error of the certificate, `constant` and `per_length`, in place of "
     "the noise of lengths and of the scale, with `scope` as of `scale`",
 }
@@ -759,7 +757,7 @@ SETTINGS: Mapping[str, str] = {
     '`"*.x": 5 um`. Of a position also `range`, `angle` and `centering`, as of a tracker. In place '
     "of a standard deviation `{limit: 15 um}` (uniform within it) or `{U: 10 um, k: 2}`",
     "noise_source": "`assumed` for a noise that users did not give, as in imported files. Default: "
-    "`stated`. Assumed noise decides no quality gate",
+    "`stated`. Quality gates ignore assumed noise",
     **SHARED_ERRORS,
     "unknowns": "name or pattern -> prior knowledge of a setup parameter (frame, target, surface, "
     "offset), or `fixed`",

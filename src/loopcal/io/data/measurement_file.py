@@ -176,7 +176,7 @@ def _join_poses(files: Sequence[_File], robot: Mechanism) -> dict[str, tuple[int
     if not origin:
         why = "no row has readings. Add a row with readings for each pose"
         if all(file.is_base.all() for file in files):
-            why = "all rows measure targets on the base, so there is no pose"
+            why = "all rows measure targets on the base, none a pose"
             why += ". Give the file of the poses, too"
         raise files[0].table.row_error(0, why)
     return origin
@@ -282,7 +282,7 @@ def _read_file(table: Table, kinds: tuple[KindRows, ...], robot: Mechanism, seve
     first: dict[str, int] = {}
     is_of_base = len(table) > 0 and bool(is_base.all())
     if several and "pose" not in table.units and not is_of_base:
-        sentence = "files are joined by the names of poses, and this file names none"
+        sentence = "loopcal joins files by the names of poses, and this file has none"
         raise table.header_error(f"{sentence}. Add a column 'pose'")
     for row in np.flatnonzero(~is_base).tolist():
         if not names[row]:
@@ -317,7 +317,7 @@ def _read_readings(file: _File, robot: Mechanism, several: bool) -> _File:
     if not may_be_absent:
         # with several files, another one may state all readings of a pose
         is_first = begin == np.arange(len(rows))
-        hint = f", or state '{READING_NOISE}', to mark empty cells as not read"
+        hint = f", or give '{READING_NOISE}' to mark empty cells as not read"
         for row in np.flatnonzero(is_first & absent.any(axis=1) & ~(several & absent.all(axis=1))):
             name = (*columns, *loads)[int(np.argmax(absent[row]))].name
             sentence = f"column {name!r} is empty"
@@ -371,7 +371,7 @@ def _list_load_columns(table: Table, robot: Mechanism) -> list[str]:
     else:
         stated = (*forces, *robot.assembly.load.stated)
         names = [name for name in FORCES if name in stated] or ["force.z"]
-    require_columns(table, names, f"of the load on {robot.name}, 0 where there is none")
+    require_columns(table, names, f"of the load on {robot.name}, 0 for none")
     return names
 
 
@@ -400,9 +400,7 @@ def _load_controller(table: Table, robot: Mechanism) -> Mechanism | None:
     name = table.settings.content.get("controller")
     if not any(column.startswith(COMMANDED) for column in table.names):
         if name is not None:
-            sentence = (
-                "a controller is named, but this file has readings, not commanded coordinates"
-            )
+            sentence = "'controller' needs commanded coordinates, and this file has readings"
             raise table.settings.error(f"{sentence}. Remove 'controller'", ("controller",))
         return None
     beside = find_reference(table.settings, "controller", list_shipped_robots())
@@ -663,12 +661,12 @@ def read_tables(path: Paths) -> tuple[Table, ...]:
     given = path if isinstance(path, list | tuple) else [path]
     paths = [as_path(file, WHAT) for file in given]
     if not paths:
-        raise DataError("no measurement file is given. Name at least one")
+        raise DataError("the list of measurement files is empty. Name at least one")
     tables: list[Table] = []
     for file in paths:
         table = read_table(file)
         if any(file.samefile(other.path) for other in tables):
-            raise FileError("this file is given twice. Name it once", file)
+            raise FileError("this file occurs twice. Name it once", file)
         if "format" in table.settings.content:
             check_format(table.settings, FORMAT)
         tables.append(table)
@@ -765,7 +763,7 @@ UNKNOWN_TARGETS = """\
 """Remark of a template on targets of unknown place."""
 
 UNKNOWN_FRAME = """\
-# The instrument may stand anywhere; its frame ({}) is identified. If it is moved, even a
+# The instrument may stand anywhere: the fit finds its frame ({}). If it moves, even a
 # little, give the rows before and after it different names in a column session."""
 """Remark of a template on an instrument whose frame is unknown."""
 
@@ -949,11 +947,11 @@ def _refuse_names(data: Measurements) -> None:
             reason = f"names of poses must not be empty or contain {LINK!r}"
         else:
             continue
-        raise DataError(f"the {what} {name!r} cannot be written: {reason}. Rename it")
+        raise DataError(f"cannot write the {what} {name!r}: {reason}. Rename it")
     labels = [unicodedata.normalize("NFC", name) for name in data.labels]
     if len(set(labels)) < len(labels):
         name = next(name for name in labels if labels.count(name) > 1)
-        raise DataError(f"two poses are named {name!r}, but names must differ. Rename one")
+        raise DataError(f"two poses have the name {name!r}, but names must differ. Rename one")
 
 
 def _tabulate_readings(

@@ -620,7 +620,7 @@ def fill_sheet(
 def _read_sheet(path: Path, robot: Mechanism) -> tuple[Table, KindRows]:
     """Return the sheet and its only kind; FileError where it has measured values or other rows."""
     table = read_table(path)
-    require_columns(table, ("pose",), "which the points of an export are joined with")
+    require_columns(table, ("pose",), "to join the points of an export with")
     kinds = read_kinds(table, robot)
     if len(kinds) != 1 or kinds[0].kind.poses_per_row != 1 or "kinds" in table.settings.content:
         raise FileError(report_finding("sheet.kinds", count=len(kinds)), path)

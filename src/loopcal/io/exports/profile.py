@@ -402,9 +402,7 @@ def check_columns(profile: Profile) -> None:
     for name in measured:
         count = sum(column in record.columns for column in (name, MEASURED + name))
         if count != 1:
-            sentence = (
-                f"'columns' gives {count} sources of {name!r}, but one is needed in {subject}"
-            )
+            sentence = f"'columns' gives {count} sources of {name!r}, but {subject} needs one"
             raise file.error(f"{sentence}. Correct it", ("columns",))
     pattern = record.columns["pose"].pattern if "pose" in record.columns else None
     has_target = "" not in profile.columns_by_target  # each line has the columns of all
@@ -523,7 +521,7 @@ def _check_places(file: YamlFile, places: Sequence[Place], location: Location) -
             sentence = f"{place!r} is neither a name in the export's header nor a place from 1"
             raise file.error(f"{sentence}. Correct it", location)
     if not places:
-        sentence = "no column is named. Write a name in the export's header or a place from 1"
+        sentence = "the column has no name. Write a name in the export's header or a place from 1"
         raise file.error(sentence, location)
 
 

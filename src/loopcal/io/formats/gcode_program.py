@@ -110,7 +110,7 @@ def format_gcode(
             if "roll" in robot.controlled
             else []
         ),
-        f"(Lengths in {unit}. The paths from home are checked; the way to home is not.)",
+        f"(Lengths in {unit}. loopcal has checked the paths from home, not the way to home.)",
         f"{UNIT_CODES[unit]} G90 G94 G40 G49 G61",
         "(MSG, the next move goes to home: check that the way is free)",
         "M0",

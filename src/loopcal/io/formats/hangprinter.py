@@ -129,7 +129,7 @@ def read_config(file: ValueFile, options: ImportOptions) -> Imported:
     def list_numbers(command: str, letter: str, count: int) -> tuple[float, ...]:
         numbers = file.numbers(command, letter, ":")
         if len(numbers) != count:
-            sentence = f"{letter} of {command} has {len(numbers)} numbers, but {count} are needed"
+            sentence = f"{letter} of {command} has {len(numbers)} numbers, but must have {count}"
             raise file.error(f"{sentence}. Correct it", command, letter)
         return numbers
 
@@ -210,11 +210,11 @@ def parse(path: Path) -> Samples:
     """Read and check the file; FileError as `read`."""
     content = read_json(path, "file of samples", "correct it, or choose another format")
     if not isinstance(content, dict) or SAMPLES not in content:
-        raise FileError(f"no key {SAMPLES!r}: these are not samples of a hanging printer", path)
+        raise FileError(f"samples of a hanging printer need the key {SAMPLES!r}", path)
     motors = _parse_numbers(content, SAMPLES, path, 2)
     lines = motors.shape[1]
     if not FREEDOMS <= lines <= MOST_LINES:
-        sentence = f"{SAMPLES!r} has {lines} motors in a row; 3 to {MOST_LINES} are allowed"
+        sentence = f"{SAMPLES!r} has {lines} motors in a row. Allowed: 3 to {MOST_LINES}"
         raise FileError(sentence, path)
     known = np.zeros((0, FREEDOMS))
     if content.get(POSITIONS) != []:
@@ -261,7 +261,7 @@ def estimate_anchors(samples: Samples, path: Path) -> FloatArray:
         f"Add known poses at several heights to {POSITIONS!r} (mm), or add the key {ANCHORS!r} (mm)"
     )
     if not len(samples.known):
-        raise FileError(f"no pose is known. {act}", path)
+        raise FileError(f"the samples give no pose. {act}", path)
     extensions = samples.motors[: len(samples.known)] * samples.gain
     anchors = []
     for i, (name, extension) in enumerate(zip(samples.names, extensions.T, strict=True)):

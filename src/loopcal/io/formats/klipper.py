@@ -252,7 +252,7 @@ def _parse_steps(cfg: KlipperConfig, option: str) -> tuple[float, ...]:
     """Return the steps of the towers, separated by commas."""
     steps = cfg.numbers(PROBED, option, ",")
     if len(steps) != len(STEPPERS):
-        sentence = f"{option!r} of [{PROBED}] has {len(steps)} numbers, but three are needed"
+        sentence = f"{option!r} of [{PROBED}] has {len(steps)} numbers, but must have three"
         raise cfg.error(f"{sentence}, the steps of the towers. Correct it", PROBED, option)
     return steps
 

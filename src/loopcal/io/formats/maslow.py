@@ -138,8 +138,8 @@ def write(source: ExportSource, into: Path | None) -> Exported:
     for belt in BELTS:
         for axis in "xy":
             if (name := f"{belt}.anchor.{axis}") not in values:
-                sentence = f"{source.robot.name} has no {name}, and the format maslow holds no"
-                raise DataError(f"{sentence} other robot. Use json or csv")
+                sentence = f"{source.robot.name} lacks {name}, which the format maslow needs"
+                raise DataError(f"{sentence}. Use json or csv")
             number = source.round_number(values[name] / MM, name, MM, 3)
             wanted["Maslow", belt + axis.upper()] = number
     return file.export(into, wanted, {})

@@ -188,8 +188,8 @@ def get_record(
     """Return the family's record of a robot; DataError where it is not `needed`."""
     record = getattr(source.robot.record, "record", None)
     if not isinstance(record, family):
-        sentence = f"{source.robot.name} is not {needed}, and the format {format_name} holds no"
-        raise DataError(f"{sentence} other. Use json or csv")
+        sentence = f"the format {format_name} holds {needed}, not {source.robot.name}"
+        raise DataError(f"{sentence}. Use json or csv")
     return record
 
 
@@ -214,7 +214,7 @@ def parse_number(text: str, what: str, path: Path, line: int) -> float:
     value = parse_finite(text)
     if value is not None and abs(value) <= LARGEST:
         return value
-    reason = ", but a finite number is needed" if value is None else f", beyond {LARGEST:g}"
+    reason = ", but must be a finite number" if value is None else f", above {LARGEST:g}"
     raise FileError(f"{what} is {quote(text)}{reason}. Correct it", path, line)
 
 

@@ -268,7 +268,7 @@ def format_robot(robot: Mechanism, plus_minus: FloatArray | None = None) -> str:
 def get_source(robot: Mechanism) -> RobotSource:
     """Return the origin of a robot; raise MechanismError where it was not loaded from a file."""
     if not isinstance(robot.record, RobotSource):
-        sentence = f"{robot.name} was not loaded from a robot file and has no text to write"
+        sentence = f"{robot.name} does not come from a robot file, so its text is missing"
         raise MechanismError(f"{sentence}. Use load_robot")
     return robot.record
 
@@ -529,7 +529,7 @@ def format_new_robot(family: str, name: str) -> str:
         f"# A new robot of the family {record}, with the numbers of the shipped robot {example}.",
         "# Replace them by your own.",
         "#",
-        f"# Keys of this family (docs/files.md; `loopcal check {name}.yaml` shows how it is read):",
+        f"# Keys of this family (docs/files.md, the interpretation: `loopcal check {name}.yaml`):",
     ]
     for key in list_keys(FAMILIES[record]):
         default = f", default {key.default}" if key.default not in ("", "needed") else ""

@@ -56,7 +56,7 @@ INSTRUCTIONS = """\
 ## Points of the tool of {robot}, in this order. Point p0 of a group is free: move close to its row,
 ## stop, and note the position that the measuring machine shows. Move to each other point of the
 ## group until the coordinates under hold equal those noted for p0 within the tolerance. Then write
-## the readings into the data file; those of p0 belong into both of its rows, because it is on the
+## the readings into the data file. Write the readings of p0 into both of its rows, as it is on the
 ## plane and on the line. All numbers here are nominal values."""
 
 

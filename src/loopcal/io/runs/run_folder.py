@@ -321,7 +321,7 @@ def _read_member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarra
     """Return one array; ValueError where its header does not agree with its bytes."""
     name = member.filename
     if member.compress_type != zipfile.ZIP_STORED or member.file_size != member.compress_size:
-        raise ValueError(f"{name!r} is compressed")
+        raise ValueError(f"compression of {name!r}")
     with archive.open(member) as stream:
         version = np.lib.format.read_magic(stream)
         if version != (1, 0):
@@ -420,7 +420,7 @@ def read_run_arrays(path: Path, digest: str | None) -> dict[str, np.ndarray]:
     try:
         arrays = read_arrays(path)
     except ValueError as error:
-        raise report_damage(path, f"it cannot be read ({error})") from error
+        raise report_damage(path, f"reading it fails ({error})") from error
     if problem := find_problem(arrays, is_complete=digest is not None):
         raise report_damage(path, problem)
     return arrays
@@ -660,7 +660,7 @@ class Run(Result):
             raise FileError(sentence, self.path)
         for file in files.values():
             if sha256(file["path"]) != file["sha256"]:
-                sentence = f"this file was changed since the run in {self.path}. Restore it"
+                sentence = f"this file differs from the file of the run in {self.path}. Restore it"
                 raise FileError(sentence, file["path"])
         data = load_measurements([f["path"] for f in files.values()], self.robot, **allowed)
         fitted = [label not in (*self.held_out, *self.excluded) for label in data.labels]
@@ -771,14 +771,14 @@ def read_run_folder(path: str | Path) -> tuple[dict[str, Any], dict[str, np.ndar
     """
     path = as_path(path, "run folder")
     if not (path / RESULT).is_file():
-        is_folder = f"is not a run folder (it has no {RESULT})"
+        is_folder = f"is not a run folder ({RESULT} is missing)"
         sentence = f"this {is_folder if path.exists() else 'run folder does not exist'}"
         leftover = "" if path.exists() else describe_leftover(path, RESULT)
         advice = leftover or "name a folder that a calibration wrote"
         raise FileError(f"{sentence}; {advice}", path)
     names = (ARRAYS, _find_robot_file(path).name)
     if missing := [name for name in names if not (path / name).is_file()]:
-        sentence = f"this run folder is damaged: {' and '.join(missing)} missing"
+        sentence = f"this run folder lacks {' and '.join(missing)}"
         raise FileError(f"{sentence}. Restore it, or repeat the calibration", path)
     result = read_result(path / RESULT)
     digest = result["files"].get(ARRAYS, "none") if "files" in result else None

@@ -57,6 +57,6 @@ def register_kind(kind: type[K]) -> type[K]:
 
     if not (isinstance(kind, type) and issubclass(kind, Kind) and is_dataclass(kind)):
         raise DataError(
-            f"{kind!r} is not a kind of measurement: it is not a dataclass that extends Kind"
+            f"{kind!r} is not a dataclass that extends Kind, as a kind of measurement must be"
         )
     return KINDS.register(kind)

@@ -322,8 +322,8 @@ class Autocollimation(AxisKind):
     `atan2(d_x, d_z)` and `atan2(d_y, d_z)`, wrapped.
 
     d is the normal of the mirror in the frame of the instrument. The z axis of that frame is the
-    optical axis and has the direction of the normal, towards the instrument. Angles are those of
-    the mirror. An instrument that states angles of the reflected beam states twice these values.
+    optical axis and has the direction of the normal, towards the instrument. Angles belong to the
+    mirror. An instrument with angles of the reflected beam shows twice these values.
 
     Setup parameters [rad]: `frame.rx` to `frame.rz`, `mirror.u` and `mirror.v`.
 

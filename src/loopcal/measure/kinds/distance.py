@@ -57,8 +57,8 @@ class LengthKind(TargetKind):
         return list_rows(
             np.any(measured <= 0.0, axis=1),
             lambda i: (
-                f"has a distance of {measured[i][measured[i] <= 0.0][0]:.6g} m; a distance is "
-                "above 0: correct it, or leave the cell empty if nothing was measured"
+                f"has a distance of {measured[i][measured[i] <= 0.0][0]:.6g} m. A distance is "
+                "above 0: correct it, or leave the cell empty if you measured nothing"
             ),
         )
 
@@ -76,7 +76,7 @@ class Distance(LengthKind):
     |x - c|`.
 
     Setup parameters [m]: `anchor.x` to `anchor.z`, `target.x` to `target.z` of each target, and
-    `distance.offset`, which is called after `frame` or `anchor_name` where these are stated.
+    `distance.offset`, with the name of `frame` or `anchor_name` where these are stated.
 
     Parameters
     ----------
@@ -139,7 +139,7 @@ class Distance(LengthKind):
             stated = (self.anchor - middle) @ axes[2]
             if not self.anchor.any() or abs(stated) <= FLATNESS * s[0]:
                 raise DataError(
-                    f"all distances to {self.anchor_name!r} were measured from points in one "
+                    f"all distances to {self.anchor_name!r} begin at points of one "
                     "plane, so it can be on either side of that plane. Give an approximate "
                     "'anchor', or measure poses off the plane"
                 )

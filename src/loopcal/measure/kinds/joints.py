@@ -36,7 +36,7 @@ class JointSensor(Kind):
     Parameters
     ----------
     joints : passive joints as `limb.joint`, driven ones by the name of their actuator. The columns
-        have the same names.
+        have equal names.
     measures : "length" or "angle": the dimension of the joints.
     unknown : "offset": the value that each sensor shows where its joint is zero.
 

@@ -228,8 +228,8 @@ class Kind(ABC):
             )
         if self.is_of_base and not self.measures_points:
             raise DataError(
-                f"the kind {self.name!r} measures a moving body, but `of: {BASE}` is for targets "
-                "that are fixed to the base. Leave it out, or use the kind position, bearing or "
+                f"the kind {self.name!r} measures a moving body, but `of: {BASE}` needs targets "
+                "on the base. Leave it out, or use the kind position, bearing or "
                 "distance"
             )
         scales = [name for name in names if name in SCALES]
@@ -634,7 +634,7 @@ class Kind(ABC):
             return np.broadcast_to(np.eye(4), T.shape)
         if joints.shape[-1] != 12:
             raise DataError(
-                f"the platform of stage {self.of!r} is not given. Pass its numbers as `joints`"
+                f"the platform of stage {self.of!r} is missing. Pass its numbers as `joints`"
             )
         rows = joints.reshape(*joints.shape[:-1], 3, 4)
         last = np.broadcast_to(np.eye(4)[3:], (*rows.shape[:-2], 1, 4))

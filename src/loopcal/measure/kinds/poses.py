@@ -308,7 +308,7 @@ def compare_poses(T: FloatArray, reference: FloatArray) -> tuple[FloatArray, Flo
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Component(ToolKind):
-    """Some coordinates of the tool; z alone is a probed height. Residual: `predicted - measured` of
+    """Some coordinates of the tool. z alone is a probed height. Residual: `predicted - measured` of
     each, angles wrapped into (-pi, pi].
 
     With E the rates of the declared angles, Q the rotation from base to frame and a the arm from
@@ -324,7 +324,7 @@ class Component(ToolKind):
     components : measured coordinates in the order of the columns: x y z, and angles of the declared
         orientation.
     orientation : form of the angles, "tilt-torsion" (phi theta psi) or "euler-" and an order (a b
-        c). Required if an angle is measured.
+        c). Required for angles.
     Others : see `ToolKind`.
 
     Raises
@@ -352,7 +352,7 @@ class Component(ToolKind):
         form = self.form
         if form is not None and not form.angles:
             raise DataError(
-                f"single components of a {form.name} cannot be measured: declare tilt-torsion, or "
+                f"a {form.name} has no single components to measure. Declare tilt-torsion, or "
                 "euler- with an order such as euler-xyz, or use the kind 'pose'"
             )
         for name in self.components:
@@ -365,7 +365,7 @@ class Component(ToolKind):
         check_names(self.components, "components")
         if "phi" in self.components and "theta" not in self.components:
             raise DataError(
-                "phi needs theta, because phi is undefined at theta = 0. Measure both or neither"
+                "phi needs theta, because phi has no value at theta = 0. Measure both or neither"
             )
 
     @cached_property
@@ -405,8 +405,8 @@ class Component(ToolKind):
         return list_rows(
             determinant < SINGULAR_RATES,
             lambda i: (
-                f"has b = {np.rad2deg(middle[i]):.6g} deg, where a and c of {name} are the "
-                "same rotation; declare another order, or use the kind 'pose'"
+                f"has b = {np.rad2deg(middle[i]):.6g} deg, at which a and c of {name} are one "
+                "rotation. Declare another order, or use the kind 'pose'"
             ),
         )
 

@@ -97,7 +97,7 @@ class TargetKind(Kind):
             set_fields(self, places=check_array(places, "the places of the targets", shape))
         elif self.is_of_base and "targets" not in self.unknown:
             raise DataError(
-                f"the places of {', '.join(targets)} on the base are neither stated nor unknown. "
+                f"the places of {', '.join(targets)} on the base are neither given nor unknown. "
                 "Give `places` in the base frame, or list targets in `unknown`"
             )
         elif self.is_of_base:
@@ -336,7 +336,7 @@ class Position(TargetKind):
         if extent[1] <= FLATNESS * extent[0]:
             raise DataError(
                 f"the {len(positions)} positions are collinear, so the rotation of the frame "
-                f"{self.frame!r} about their line is not determined. Measure poses off the "
+                f"{self.frame!r} about their line stays open. Measure poses off the "
                 f"line, or give a known T_base_frame"
             )
 

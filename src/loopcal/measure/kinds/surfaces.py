@@ -38,8 +38,8 @@ class SurfaceKind(TargetKind):
     through : (3,) [m], a point of the surface (of a sphere: its center) in the frame. If the
         surface is unknown, its nominal value.
     along : (3,), normal of a plane or direction of a line, in the frame; of any length.
-    surface : name of the surface; its parameters begin with it. A plane and a line with the same
-        name, point and direction share `u` and `v`: the line is perpendicular to the plane.
+    surface : name of the surface; its parameters begin with it. A plane and a line with equal name,
+        point and direction share `u` and `v`: the line is perpendicular to the plane.
     Others : see `TargetKind`; "frame", "surface" and "targets" (the offsets of the probe) may be
     unknown. Faces of a body with known dimensions, such as a datum cube, are known surfaces in one
     unknown frame.
@@ -205,7 +205,7 @@ class Sphere(SurfaceKind):
     """Points on a sphere about c, such as a probed ball. Residual: `|x - c| - radius - gap`.
 
     An unknown sphere has four parameters for each group of rows: its center and its radius, which
-    includes that of the probe.
+    includes the probe's.
 
     Setup parameters [m]: `sphere.x` to `sphere.z` and `sphere.radius`, and `target.x` to
     `target.z` of each target.

@@ -232,7 +232,7 @@ Drive = LengthDrive | AngleDrive | SpoolDrive | ScrewDrive | TriangleDrive
 
 @dataclass(frozen=True, kw_only=True)
 class Condition:
-    """A column of the data that is never commanded: `temperature`, `temperature.PLACE` [degC],
+    """A column of the data that no command sets: `temperature`, `temperature.PLACE` [degC],
     `time` [s], or of the load `force.AXIS` [N], `moment.AXIS` [Nm]. Where none is given it has its
     `reference`; simulations draw it from its `range`.
     """
@@ -273,7 +273,7 @@ class CouplingRecord(Sum):
 @dataclass(frozen=True, kw_only=True)
 class AngleCoupling(CouplingRecord):
     """Gears, a belt or a differential between rotary joints: the sum of weight * joint value is
-    the `offset`. Joints are drives, or passive joints `limb.joint`; `unknown` names weights and
+    the `offset`. Joints are drives or passive joints `limb.joint`; `unknown` names weights and
     offset. With a `condition` it is offset + slope * (condition - reference), the slope in units
     of the sum per degC or second.
     """
@@ -735,7 +735,7 @@ def _find_reference(key: str, coupling: Coupling, conditions: Mapping[str, Condi
     name = coupling.condition
     if name in FORCES:
         raise RecordError(
-            f"coupling {key!r} names {name!r}, but a load acts through drives; state the "
+            f"coupling {key!r} names {name!r}, but a load acts through drives. Give the "
             "`compliance:` of a drive",
             "couplings",
             key,
@@ -806,8 +806,8 @@ def _check_rows(sums: Mapping[str, Mapping[str, float]], known: Mapping[str, str
     unread = [joint for joint in known if joint not in read]
     if unread:
         raise DriveError(
-            f"joint {unread[0]!r} of limb {known[unread[0]]!r} is in no sum, so no reading states "
-            f"it. Add it to a `sum:`, or list {unread[0]!r} among the actuators",
+            f"joint {unread[0]!r} of limb {known[unread[0]]!r} is in no sum, so its readings are "
+            f"missing. Add it to a `sum:`, or list {unread[0]!r} among the actuators",
             next(iter(sums)),
         )
     W = np.array([[weights.get(joint, 0.0) for joint in known] for weights in sums.values()])
@@ -822,8 +822,8 @@ def _check_rows(sums: Mapping[str, Mapping[str, float]], known: Mapping[str, str
         if count_independent(W[: i + 1]) <= i:
             name = list(sums)[i]
             raise DriveError(
-                f"the weights of the sums are singular: that of actuator {name!r} follows from "
-                f"those of {', '.join(list(sums)[:i])}, so it states nothing new. Correct a weight",
+                f"the weights of the sums are singular: the sum of actuator {name!r} follows from "
+                f"{', '.join(list(sums)[:i])}. Correct a weight",
                 name,
             )
 
@@ -855,7 +855,7 @@ def refuse_idle_drives(
             raise DriveError(
                 f"actuator {name!r} drives no joint{suggest_names(name, sorted(known))}. Write "
                 f"'actuated: {name}' at one, or leave it out"
-                + (f"; joints are driven by {', '.join(used)}" if used else ""),
+                + (f". {', '.join(used)} drive joints" if used else ""),
                 name,
             )
 
@@ -876,20 +876,20 @@ def _check_drive(placed: PlacedDrive) -> None:
     for term in HARMONICS:
         if term in stated and not drive.period:
             raise DriveError(
-                f"actuator {name!r} states {term}, but no period. Give the reading's period", name
+                f"actuator {name!r} has {term}, but no period. Give the reading's period", name
             )
     if "curve" in stated and not np.isfinite(placed.list_terms()["curve"].maps["curve"]):
         raise DriveError(
-            f"actuator {name!r} states a curve, the deviation at the far end of its stroke, but no "
+            f"actuator {name!r} has a curve, the deviation at the far end of its stroke, but no "
             "stroke. Give the stroke",
             name,
         )
     if drive.compliance < 0.0:
-        raise DriveError(f"the compliance of actuator {name!r} is negative; state its size", name)
+        raise DriveError(f"the compliance of actuator {name!r} is negative. Give its size", name)
     if "compliance" in drive.unknown and drive.compliances is None:
         raise DriveError(
-            f"the compliance of actuator {name!r} is unknown; state `compliances:`, the tolerance "
-            "of its stated value",
+            f"the compliance of actuator {name!r} is unknown. Give `compliances:`, the tolerance "
+            "of its given value",
             name,
         )
     if drive.table:
@@ -940,14 +940,14 @@ def place_triangle(
     if not high**2 - low**2 > 4 * ON_AXIS * float((points**2).sum(axis=1).max()):
         raise DriveError(
             f"the triangle of actuator {name!r} is degenerate: an anchor is on the axis of the "
-            "joint, so the length is the same at every angle. Give anchors away from the axis",
+            "joint, so all angles give one length. Give anchors away from the axis",
             name,
         )
     sine, middle = find_side(start, terms)
     if abs(sine) < DEAD:
         raise DriveError(
             f"actuator {name!r} does not turn its joint at {np.rad2deg(start):g} deg, a dead point "
-            "of its triangle, where both anchors and the axis are in one plane. Give another "
+            "of its triangle: both anchors and the axis are in one plane. Give another "
             "`start:` of the joint, or other anchors",
             name,
         )

@@ -192,7 +192,7 @@ class Gough(RobotRecord):
             if not length >= 0.0:
                 raise MechanismError(
                     f"leg {i + 1} of {self.name} has the length {length * 1e3:g} mm at reading "
-                    "zero; a length must be positive, or zero where readings are whole lengths"
+                    "zero. A length must be positive, or zero if readings are whole lengths"
                 )
             leg, motor = self._leg(i, length), f"q{i + 1}"
             legs.append(leg)

@@ -123,7 +123,7 @@ class Universal:
 
 @dataclass(frozen=True)
 class Cylindrical:
-    """A rotation about and a slide along the same axis."""
+    """A rotation about and a slide along one axis."""
 
     joint: Literal["C"]
     name: str = ""
@@ -153,8 +153,8 @@ JointRecord = Revolute | Prismatic | Universal | Cylindrical | Spherical
 class Copies:
     """Copies of a limb, rotated about an axis of base and platform.
 
-    The numbers 1, 2, .. are appended to its names. Copy i is rotated by start + (i - 1) step;
-    without a step the copies divide the full turn.
+    Its names end with the numbers 1, 2, .. Copy i has the rotation start + (i - 1) step. Without a
+    step the copies divide the full turn.
     """
 
     count: int
@@ -206,14 +206,14 @@ class RodCone:
 
 @dataclass(frozen=True)
 class BodyRecord:
-    """A body inside the loops, beside base and platform, that limbs join.
+    """A further body inside the loops that limbs join.
 
     Attributes
     ----------
-    home : first guess of its pose in the base at home; without it the joints of a rigid limb, at
+    home : first guess of its pose in the base at home. Without it the joints of a rigid limb, at
         their `start`, place the body.
     copies : repeat the body around an axis. Copy i of a limb that names it joins copy i of the
-        body, and is written in the frame of that copy.
+        body, in the frame of that copy.
     """
 
     name: str
@@ -228,8 +228,8 @@ class LimbRecord:
     Attributes
     ----------
     on, to : the bodies where it begins and ends: `base`, `platform`, or one of `bodies:`.
-    chain : its joints. tip : its end, in the last carried frame; in a limb without joints its point
-        on the first body.
+    chain : its joints. tip : its end, in the last carried frame, or without joints its point on the
+        first body.
     ending : `rigid`, `ball` (tip and attachment meet in a point) or `distance` (a rod of `length`
         between them).
     attach : the attachment in the frame of the second body. actuated : the drive of a `distance` of
@@ -259,7 +259,7 @@ class Limbs(RobotRecord):
     Attributes
     ----------
     freedoms : of the platform, in base axes. controlled : coordinates in which it is commanded.
-    bodies : those beside base and platform. limbs : from body to body. error_model : see the
+    bodies : further bodies. limbs : from body to body. error_model : see the
         module. tolerances : of the complete model. closure : how over-constrained loops
         close.
     """
@@ -379,7 +379,7 @@ def _check_ends(limbs: Sequence[Limb], names: Sequence[str]) -> None:
     for name in names:
         if name in (BASE, PLATFORM) or names.count(name) > 1:
             raise MechanismError(
-                f"two bodies are called {name!r}, base and platform among them. Rename one"
+                f"two bodies have the name {name!r}, base and platform among them. Rename one"
             )
         if name not in joined:
             raise MechanismError(
@@ -417,7 +417,7 @@ def _place_copy(
     """
     if limb.ending != "distance" and (limb.length or limb.actuated or limb.cones):
         raise MechanismError(
-            f"limb {limb.name!r} ends {limb.ending} and states a length, drive or cone of a rod. "
+            f"limb {limb.name!r} ends {limb.ending} and has a length, drive or cone of a rod. "
             "Give ending: distance, or leave it out"
         )
     if limb.ending == "distance" and not limb.actuated and not limb.length > 0:

@@ -404,9 +404,9 @@ Point = tuple[Length, Length, Length]
 
 @dataclass(frozen=True)
 class PoseRecord:
-    """Position and orientation R = Rz(yaw) Ry(pitch) Rx(roll), as a robot file states them.
+    """Position and orientation R = Rz(yaw) Ry(pitch) Rx(roll), as in a robot file.
 
-    A file may state tilt-and-torsion phi, theta, psi in place of roll, pitch, yaw.
+    Allowed in place of roll, pitch, yaw: tilt-and-torsion phi, theta, psi.
     """
 
     x: Length = 0.0

@@ -140,7 +140,7 @@ def find_engine_axis(name: str, entry: MapEntry) -> tuple[str, float]:
     """
     if entry.axis == "pitch":
         raise MechanismError(
-            f"parameter {name!r} is mapped onto 'pitch'. Use lead, the advance in one turn"
+            f"parameter {name!r} maps onto 'pitch'. Use lead, the advance in one turn"
         )
     coefficient = entry.coefficient * (1.0 if entry.arm is None else entry.arm)
     if entry.axis == "lead":
@@ -213,7 +213,7 @@ def _map_entry(
     if not chosen:
         known = dict.fromkeys([*(limb.stem for limb in limbs), *sorted(drives)])
         raise MechanismError(
-            f"parameter {name!r} is mapped onto {entry.limb!r}, which is not there. Known: "
+            f"parameter {name!r} maps onto {entry.limb!r}, which does not exist. Known: "
             f"{', '.join(known)}"
         )
     for limb in chosen:
@@ -229,7 +229,7 @@ def _map_entry(
 
 @dataclass(frozen=True)
 class CommonErrorRecord:
-    """An error that several parameters share in addition to their own, such as that of one batch.
+    """An error that several parameters share in addition to their own, such as one batch.
 
     Attributes
     ----------
@@ -252,7 +252,7 @@ class CommonErrorRecord:
         stated = {d: t for d in Dimension if (t := getattr(self, d.value, None)) is not None}
         if len(stated) != 1:
             raise RecordError(
-                f"common error {self.name!r} states {len(stated)} tolerances. Give one, such as "
+                f"common error {self.name!r} has {len(stated)} tolerances. Give one, such as "
                 "`length: {sd: 0.1}`",
                 *at,
             )
@@ -326,15 +326,15 @@ class RobotRecord:
     Attributes
     ----------
     name : name of the robot. source : origin of its numbers.
-    home : platform pose in the base at which the loops are closed first; zero by default.
-    tool : tool pose on the platform. workspace : where the machine works; poses are drawn from it.
-    fixed : parameters that are not identified, by name or pattern, such as `arm*.length`.
+    home : platform pose in the base at which loopcal closes the loops first (default: zero).
+    tool : tool pose on the platform. workspace : region of work, from which loopcal draws poses.
+    fixed : parameters outside the fit, by name or pattern, such as `arm*.length`.
     stored_parameters : parameters that the controller of the machine stores, by name or pattern.
-    common_errors : errors that several parameters share, such as those of one batch of parts or of
-        a common zero.
-    drives : by name; in limbs that are numbered, `q` means q1, q2, .. One that is not listed reads
-        the joint value. couplings : of driven and passive joints, by name. conditions : data
-        columns in them, and the load on the platform. load : where this load acts. parameters : of
+    common_errors : errors that several parameters share, as parts of one batch do, or a common
+        zero.
+    drives : by name. In numbered limbs, `q` means q1, q2, .. Without an entry a drive reads the
+        joint value. couplings : of driven and passive joints, by name. conditions : data columns in
+        them, and the load on the platform. load : point and axes of this load. parameters : of
         one's own, with maps onto limbs and drives.
     """
 
@@ -360,7 +360,7 @@ class RobotRecord:
 
     def expand(self) -> Assembly:
         """Return the generic description of this robot."""
-        raise TypeError("a record of no family cannot be expanded")
+        raise TypeError("a record without family has no assembly")
 
     def assemble(
         self,
@@ -432,13 +432,13 @@ class RobotRecord:
         titles = [error.name for error in common]
         if duplicate := [title for title in titles if titles.count(title) > 1]:
             raise MechanismError(
-                f"two common errors are called {duplicate[0]!r}. Give each its own name"
+                f"two common errors have the name {duplicate[0]!r}. Give each its own name"
             )
         load = self.load.place(self.conditions)
         is_elastic = any(a.name.startswith(LOAD) for a in expanded.actuators)
         if not is_elastic and (load.stated or self.load != LoadFrame()):
             raise RecordError(
-                f"{self.name} states a load, but no drive with a compliance; state a `compliance:` "
+                f"{self.name} has a load, but no drive with a compliance. Give a `compliance:` "
                 "under `drives:`",
                 "conditions" if load.stated else "load",
                 *load.stated[:1],
@@ -483,6 +483,6 @@ def check_spherical(name: str, spherical: str, error_model: str) -> None:
     """Refuse balls of three axes without errors; raises MechanismError."""
     if spherical == "axes" and error_model == "ideal":
         raise MechanismError(
-            f"{name} states spherical: axes with error_model: ideal, whose parameters describe "
+            f"{name} has spherical: axes with error_model: ideal, whose parameters describe "
             "perfect points. Give error_model: complete, or spherical: point"
         )

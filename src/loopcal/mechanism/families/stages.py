@@ -77,17 +77,17 @@ def check_stage_names(names: Sequence[str], parents: Sequence[str | None]) -> li
     """Return what each stage is on: BASE, or an earlier stage; None stands for the previous one."""
     if not names:
         raise StageError(
-            "there are no stages. List the coordinates of the chain, from the base on", 0
+            "the list of stages is empty. List the coordinates of the chain, from the base on", 0
         )
     previous = [BASE, *names]
     stated = [previous[i] if on is None else on for i, on in enumerate(parents)]
     for i, name in enumerate(names):
         if name in names[:i]:
-            raise StageError(f"two stages are called {name!r}. Give each its own name", i)
+            raise StageError(f"two stages have the name {name!r}. Give each its own name", i)
         if name == BASE or "." in name or ":" in name or not name:
             raise StageError(
-                f"a stage cannot be called {name!r}. Choose a name without a point or colon, other "
-                f"than {BASE!r}",
+                f"a stage cannot have the name {name!r}. Choose a name without a point or colon, "
+                f"other than {BASE!r}",
                 i,
             )
     for i, (name, on) in enumerate(zip(names, stated, strict=True)):
@@ -205,9 +205,9 @@ class SerialJoint:
 
     Attributes
     ----------
-    at : where it is on the platform that carries it. axis : direction in the placed frame.
+    at : its place on the platform that carries it. axis : direction in the placed frame.
     tip : platform of this stage in the placed frame, at joint value zero.
-    start : reading at home; with a triangle, angle of the joint at home. stroke : allowed readings.
+    start : reading at home, with a triangle the angle of the joint. stroke : allowed readings.
     gain : joint value per reading.
     sigma : standard deviation of the reading.
     errors : its unknowns: displacements of the placed frame, the `offset` of the joint, its `gain`.
@@ -233,11 +233,11 @@ class SerialJoint:
 
 @dataclass(frozen=True, kw_only=True)
 class SerialRotation(SerialJoint):
-    """A driven rotary joint as a stage of its own.
+    """A driven rotary joint as a separate stage.
 
     Attributes
     ----------
-    drive : name of its actuator; default: the name of the stage. Or a linear actuator that turns
+    drive : name of its actuator (default: of the stage). Or a linear actuator that turns
         it, `{triangle: ..}`, which states its own stroke, gain, sigma and unknowns.
     """
 
@@ -249,11 +249,11 @@ class SerialRotation(SerialJoint):
 
 @dataclass(frozen=True, kw_only=True)
 class SerialSlide(SerialJoint):
-    """A driven slide as a stage of its own.
+    """A driven slide as a separate stage.
 
     Attributes
     ----------
-    drive : name of its actuator; default: the name of the stage.
+    drive : name of its actuator (default: of the stage).
     """
 
     kind: Literal["P"]
@@ -285,10 +285,10 @@ class Stages(RobotRecord):
 
     Attributes
     ----------
-    controlled : coordinates of the end platform in which the robot is commanded, one for each
-        freedom that its actuators give it. held : actuators that inverse kinematics leaves at their
-        present readings. stages : from the base on; the last one carries the end platform.
-    tolerances : of the unknowns of serial joints that state none.
+    controlled : commanded coordinates of the end platform, one for each freedom that its actuators
+        give it. held : actuators that inverse kinematics leaves at their present readings. stages :
+        from the base on. The last one carries the end platform.
+    tolerances : of the unknowns of serial joints without tolerances.
     """
 
     family = "stages"
@@ -300,7 +300,7 @@ class Stages(RobotRecord):
 
     def expand(self) -> Assembly:
         """Refuse: the robots of the stages are not known, see `PlacedStages`."""
-        raise TypeError("a chain is expanded with the records of its stages")
+        raise TypeError("a chain needs the records of its stages")
 
 
 @dataclass(frozen=True)
@@ -423,7 +423,7 @@ def _refuse_terms_beside_triangle(record: SerialRotation | SerialSlide, drive: s
     for key, is_stated in stated.items():
         if is_stated:
             raise MechanismError(
-                f"the joint states '{key}' beside the triangle of drive {drive!r}, whose readings "
+                f"the joint has '{key}' besides the triangle of drive {drive!r}, whose readings "
                 "are lengths. Give it in the drive"
                 + (" under 'unknown'" if key.startswith("errors") else "")
             )

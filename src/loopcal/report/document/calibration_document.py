@@ -339,7 +339,7 @@ def describe_budget(record: CalibrationRecord) -> Iterator[Element]:
     names = dict.fromkeys(name for facts in instruments for name in facts)
     columns = (word_column(name.replace("_", " "), wraps=True) for name in names)
     rows = ((facts.get(name, ABSENT) for name in names) for facts in instruments)
-    yield make_table("Instruments and their calibration, as stated with the data", columns, rows)
+    yield make_table("Instruments and their calibration, from the data files", columns, rows)
 
 
 @describes_section("parameters", "Parameters")
@@ -482,7 +482,7 @@ def _list_labels(what: str, labels: Sequence[str]) -> str:
     """Return the labels in one sentence; of many the first; empty without any."""
     count = len(labels)
     noun = "pose" if count == 1 else "poses"
-    limit = f", of which the first {MOST:,} are listed" if count > MOST else ""
+    limit = f", here the first {MOST:,}" if count > MOST else ""
     return f"{count:,} {what} {noun}{limit}: {', '.join(labels[:MOST])}." if labels else ""
 
 

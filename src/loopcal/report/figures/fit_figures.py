@@ -313,9 +313,9 @@ def draw_parameter_rows(
         cross: dict[str, Any] = {"color": SHIFT, "marker": "x", "ms": DOT + 1, "ls": "none"}
         handles.append(make_handle("without an interval", **cross))
     add_legend(figure, handles)
-    status = "" if converged else "; not converged: last values, no estimates"
+    status = "" if converged else ", without convergence: last values, not estimates"
     n_assumed = sum(row["tolerance_assumed"] for row in rows)
-    assumed = f"; {n_assumed} tolerances are assumed" if n_assumed else ""
+    assumed = f", {n_assumed} tolerances assumed" if n_assumed else ""
     return finish_figure(figure, f"{robot}: {name_count(p, 'parameter')}{assumed}{status}")
 
 
@@ -396,7 +396,7 @@ def draw_correlation_matrix(robot: str, names: Sequence[str], covariance: FloatA
     if np.isnan(np.diag(correlation)).any():
         words += "\ngrey: without a finite uncertainty"
     if step > 1:
-        words += f"\nevery {step}. name is written"
+        words += f"\nwith every {step}. name"
     return finish_figure(figure, f"{robot}: {words}")
 
 

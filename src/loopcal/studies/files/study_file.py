@@ -158,7 +158,7 @@ def build_study(content: StudyContent) -> Study:
         for name, value, place in _list_items(content, key):
             if not plain and not isinstance(value, dict):
                 raise file.error(
-                    f"the level {name!r} of {key!r} must state its settings. Write "
+                    f"the level {name!r} of {key!r} must have settings. Write "
                     "'name: {setting: value}' lines",
                     place,
                 )
@@ -183,7 +183,7 @@ def _load_pose_files(
         key_place = (*place, "file")
         if "coordinates" in stated:
             key_place = (*place, "coordinates")
-            raise file.error("poses are given by a file. Write 'file: poses.csv'", key_place)
+            raise file.error("a file gives the poses. Write 'file: poses.csv'", key_place)
         if "file" not in stated:
             continue
         if len(stated) > 1:
@@ -194,7 +194,7 @@ def _load_pose_files(
         try:
             read = [load_poses(path, robot).tolist() for robot in robots]
         except LoopcalError as error:
-            raise file.error(f"the poses cannot be read: {error}", key_place) from None
+            raise file.error(f"cannot read the poses: {error}", key_place) from None
         if any(poses != read[0] for poses in read):
             raise file.error("the robots of this study read other poses from this file", key_place)
         coordinates = tuple(tuple(pose) for pose in read[0])
@@ -215,7 +215,7 @@ def read_robots(content: StudyContent) -> dict[str, tuple[Robot, Mechanism]]:
             path = find_file_beside(file, value, place) or find_robot_file(value)
             robot = load_robot(path)
         except LoopcalError as error:
-            raise file.error(f"the robot {name!r} cannot be read: {error}", place) from None
+            raise file.error(f"cannot read the robot {name!r}: {error}", place) from None
         robots[name] = (Robot(value, get_source(robot).file.text), robot)
     return robots
 
@@ -234,7 +234,7 @@ def _list_items(content: StudyContent, key: str) -> Iterator[tuple[str, Any, Loc
     names = set()
     for name, value, level_place in items:
         if name in names:
-            raise file.error(f"two levels of {key!r} are named {name!r}. Remove one", level_place)
+            raise file.error(f"{key!r} has two levels {name!r}. Remove one", level_place)
         names.add(name)
         yield name, value, level_place
 
@@ -278,7 +278,7 @@ def _check_surfaces(level: PosesLevel, study: Study, robots: Sequence[Mechanism]
         for effects in study.effects.values():
             check_effects(effects)
         if study.scores.verdict:
-            raise DataError("points on planes and lines are studied without a verdict. Remove it")
+            raise DataError("a study of points on planes and lines has no verdict. Remove it")
 
 
 def _check_method(level: MethodLevel, study: Study, robots: Sequence[Mechanism]) -> None:

@@ -700,7 +700,7 @@ def replay_trial(
     ):
         if not 0 <= number < count:
             raise DataError(
-                f"this study has no {name} {number}; its {name}s are numbered from 0 to {count - 1}"
+                f"this study has no {name} {number}. Its {name}s have the numbers 0 to {count - 1}"
             )
     block, place = divmod(trial, study.block)
     (task,) = list_tasks(study, [cell], blocks=[block])

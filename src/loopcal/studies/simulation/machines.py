@@ -152,7 +152,7 @@ def make_instrument(level: InstrumentLevel, noise: NoiseLevel) -> Instrument:
             hint = suggest_names(name, known)
             raise DataError(f"{name!r} is not measured{hint}; unused may name {', '.join(known)}")
     if set(level.unused) >= set(known):
-        raise DataError("all measured columns are unused. Leave at least one")
+        raise DataError("the study uses no measured column. Leave at least one")
     return instrument
 
 
@@ -215,7 +215,7 @@ def check_effects(effects: EffectsLevel) -> None:
     for name in ("drift", "jump", "thermal", "backlash"):
         if getattr(effects, name) != getattr(plain, name):
             raise DataError(
-                f"points that are held on planes and lines are simulated without {name}. Remove it"
+                f"a simulation of points on planes and lines takes no {name}. Remove it"
             )
 
 

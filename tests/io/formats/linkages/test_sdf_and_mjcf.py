@@ -143,10 +143,10 @@ def test_coupled_joints_have_any_factor_and_are_written_back(tmp_path, case) -> 
 
 
 REFUSED = {
-    "another root": ("<robot/>", "the root is <robot>, but <mujoco> is needed"),
+    "another root": ("<robot/>", "the root is <robot>, not <mujoco>"),
     "include": (
         '<mujoco><include file="../x.xml"/></mujoco>',
-        ":1: the included file 'x.xml' cannot be read. Put it beside",
+        ":1: cannot read the included 'x.xml'. Put it next",
     ),
     "unknown body": (
         SOURCES["robot.xml"].replace('body2="rod2"', 'body2="rod3"'),

@@ -213,7 +213,7 @@ REFUSED = {
     ),
     "no motors": (
         FIVE_BAR.replace(MOTORS, ""),
-        "no motor is named. List the driven joints in 'name_mot:' of a YAML",
+        "the list of motors is empty. List the driven joints in 'name_mot:' of a YAML",
     ),
     "motor of the camera": (
         FIVE_BAR.replace("</robot>", f"{PAN}</robot>"),
@@ -291,7 +291,7 @@ CLOSURES = {
         "closed_loop: [[rod1, rod2]]\ntype: []\n",
         ":2: 'closed_loop' has 1 pairs, but 'type' has 0 entries",
     ),
-    "motor twice": ("name_mot: [mot1, mot1]\n", ":1: motor 'mot1' is named twice"),
+    "motor twice": ("name_mot: [mot1, mot1]\n", ":1: motor 'mot1' occurs twice"),
     "fixed motor": (
         "name_mot: [mot1, tip_frame]\n",
         ":1: the motor 'tip_frame' is not a movable joint",
@@ -302,15 +302,15 @@ CLOSURES = {
     ),
     "replacement": (
         "name_mot: [mot1]\njoint_name: [elbow1]\njoint_type: [BALL]\n",
-        ":3: joint 'elbow1' is replaced by 'BALL'. Allowed: SPHERICAL, FIXED, UJOINT_XY",
+        ":3: cannot replace joint 'elbow1' by 'BALL'. Allowed: SPHERICAL, FIXED, UJOINT_XY",
     ),
     "replaced joint": (
         "name_mot: [mot1]\njoint_name: [elbow]\njoint_type: [FIXED]\n",
         ":2: 'elbow' is not a movable joint of r.urdf",
     ),
-    "replaced twice": (
+    "two entries replace": (
         "name_mot: [mot1]\njoint_name: [elbow1, elbow1]\njoint_type: [FIXED, FIXED]\n",
-        "replaced twice",
+        "two entries replace",
     ),
     "lists": (
         "name_mot: [mot1]\njoint_name: [elbow1]\n",

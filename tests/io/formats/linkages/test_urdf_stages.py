@@ -164,7 +164,7 @@ def test_urdf_of_another_chain_is_refused(tmp_path) -> None:
     path = write(tmp_path, make_lever_arm())
     robot = read(path)[1]
     path.write_text(path.read_text().replace('xyz="0.0 0.0 0.2"', 'xyz="0.0 0.0 0.3"', 1))
-    with pytest.raises(LoopcalError, match="Export into the file it was read from"):
+    with pytest.raises(LoopcalError, match="Export into the file of origin"):
         export_robot(ExportSource(robot), urdf.FORMAT, path)
 
 

@@ -76,7 +76,7 @@ def test_files_without_what_is_needed_are_refused(source, tmp_path) -> None:
     file.write_text(make_ini("furlong"))
     with pytest.raises(FileError, match=r"machine.ini:4: LINEAR_UNITS is 'furlong'. Allowed: mm"):
         export(source, file)
-    with pytest.raises(DataError, match="holds no other"):
+    with pytest.raises(DataError, match="the format linuxcnc-ini holds"):
         export(ExportSource(load_robot("linear-delta")), file)
 
 

@@ -264,10 +264,10 @@ def _read_overrides(file: YamlFile, names: Any, types: Any, tree: LinkTree) -> d
             sentence = f"{quote(name)} is not a movable joint of {tree.path.name}{near}"
             raise file.error(f"{sentence}. Correct it", ("joint_name", i))
         if kind.upper() not in OVERRIDES:
-            sentence = f"joint {name!r} is replaced by {quote(kind)}. Allowed: "
+            sentence = f"cannot replace joint {name!r} by {quote(kind)}. Allowed: "
             raise file.error(sentence + ", ".join(OVERRIDES), ("joint_type", i))
         if name in overrides:
-            raise file.error(f"joint {name!r} is replaced twice. Remove one", ("joint_name", i))
+            raise file.error(f"two entries replace joint {name!r}. Remove one", ("joint_name", i))
         overrides[name] = kind.upper()
     return overrides
 
@@ -277,7 +277,7 @@ def _check_motors(tree: LinkTree, closures: Closures, motors: Sequence[str]) -> 
     ends = {name for pair in closures.pairs for name in pair}
     for i, name in enumerate(motors):
         if name in motors[:i] and closures.file is not None:
-            raise closures.file.error(f"motor {name!r} is named twice. Remove one", ("name_mot", i))
+            raise closures.file.error(f"motor {name!r} occurs twice. Remove one", ("name_mot", i))
         joint = tree.joints.get(name)
         if joint is not None and joint.kind and name not in ends | {*closures.overrides}:
             continue
@@ -293,7 +293,7 @@ def _check_motors(tree: LinkTree, closures: Closures, motors: Sequence[str]) -> 
             raise FileError(sentence, tree.path, tree.motors.get(name))
         raise closures.file.error(sentence, ("name_mot", i))
     if not motors:
-        sentence = "no motor is named. List the driven joints in 'name_mot:'"
+        sentence = "the list of motors is empty. List the driven joints in 'name_mot:'"
         if closures.file is not None:
             raise closures.file.error(sentence)
         raise FileError(f"{sentence} of a YAML file in its folder", tree.path)

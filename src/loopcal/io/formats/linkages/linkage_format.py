@@ -228,16 +228,16 @@ def _check_place(tree: LinkTree, name: str, stated: FloatArray) -> None:
     rounding = sum(sum(other.rounding) for other in tree.places.values())
     if np.abs(place - stated).max() > PLACED + rounding:
         sentence = f"joint {name!r} has another place in the robot file"
-        raise tree.error(f"{sentence}. Export into the file it was read from", name)
+        raise tree.error(f"{sentence}. Export into the file of origin", name)
 
 
 LARGE = 30.0
 """Largest distance of two joints of a link that is plausible [m]; URDF has no other unit."""
 
 REMARKS = {
-    "limbs": "Limbs are named after their first joint, joints as in the file.",
-    "stages": "Stages are named after their joint, those with loops after the link that they "
-    "carry, limbs after their first joint, joints as in the file.",
+    "limbs": "Limbs have the name of their first joint, joints their name in the file.",
+    "stages": "Stages have the name of their joint, stages with loops the name of the link that "
+    "they carry, limbs the name of their first joint, joints their name in the file.",
 }
 """What people should know about the names, by the family of the robot file."""
 

@@ -256,7 +256,7 @@ def _include(root: Element, path: Path) -> Element:
             other = path.parent / name
             is_beside = not name.is_absolute() and ".." not in name.parts
             if count >= MOST_INCLUDES or not is_beside or not other.is_file():
-                raise child.error(f"the included file {other.name!r} cannot be read. Put it beside")
+                raise child.error(f"cannot read the included {other.name!r}. Put it next to this")
             inner = parse_xml(read_text(other, WHAT), other, WHAT)
             expand(inner, count + 1)
             children += inner.children
@@ -271,7 +271,7 @@ def read_tree(path: Path) -> LinkTree:
     text = read_text(path, WHAT)
     root = parse_xml(text, path, WHAT)
     if root.name != "mujoco":
-        raise FileError(f"the root is <{root.name}>, but <mujoco> is needed. Check the file", path)
+        raise FileError(f"the root is <{root.name}>, not <mujoco>. Check the file", path)
     reader = _Reader(_include(root, path))
     reader.read_all()
     top = _choose_root(reader)
@@ -419,7 +419,7 @@ def _couple(
             known[joint.name] = replace(joint, kind="", origin=origin)
             continue
         if np.any(c[2:]):
-            raise part.error(f"{what} is not linear; only constant and linear terms are expressed")
+            raise part.error(f"{what} is not linear. Allowed: constant and linear terms")
         if stated["joint2"] in known:
             known[joint.name] = replace(joint, mimic=(stated["joint2"], float(c[1]), float(c[0])))
     return list(known.values()), tuple(notes)

@@ -122,7 +122,7 @@ class Frames:
         element = self.elements.get(name)
         if element is None or name in by:
             user = self.elements[by[-1]] if by else next(iter(self.elements.values()))
-            circle = "which is placed by itself" if element is not None else "which does not exist"
+            circle = "which depends on itself" if element is not None else "which does not exist"
             near = suggest_names(name, [*self.elements])
             raise user.error(f"{by[-1] if by else ''!r} names {name!r}, {circle}{near}. Correct it")
         return self.place_element(element, (*by, name))
@@ -210,7 +210,7 @@ def read_tree(path: Path) -> LinkTree:
     root = parse_xml(text, path, WHAT)
     models = [element for element in root.walk() if element.name == "model"]
     if root.name != "sdf" or len(models) != 1:
-        sentence = f"this SDF file has {len(models)} models, but one without others in it is needed"
+        sentence = f"this SDF file has {len(models)} models. Allowed: one, without others in it"
         raise FileError(f"{sentence}. Write one model into a separate file", path)
     (model,) = models
     in_model = root.attributes.get("version", "1.7") in ("1.0", "1.2", "1.3", "1.4")

@@ -336,7 +336,7 @@ def build_tree(
     if len(roots) != 1:
         listed = ", ".join(roots[:4])
         sentence = f"this {what.removesuffix(' file')} has {len(roots)} root links ({listed})"
-        raise FileError(f"{sentence}, but one is needed. Join them", path)
+        raise FileError(f"{sentence}. Allowed: one. Join them", path)
     _refuse_cycles(path, links, roots[0], carrier)
     for constraint in constraints:
         for link in (end.parent for end in constraint.ends):
@@ -361,8 +361,8 @@ def _refuse_cycles(
             link = carrier[link].parent
         if link in chain:
             joint = carrier[link]
-            sentence = f"joint {joint.name!r} closes a circle of links: {joint.child!r} is carried"
-            raise FileError(f"{sentence} by itself. Correct its parent", path, joint.line)
+            sentence = f"joint {joint.name!r} closes a circle of links: {joint.child!r} carries"
+            raise FileError(f"{sentence} itself. Correct its parent", path, joint.line)
         carried |= chain.keys()
 
 
