@@ -63,14 +63,7 @@ CASES = (
     Case("3-PRS, MAP", "3-prs", "pose", 20, MAP()),
     Case("delta, least squares", "linear-delta", "component", 20, LeastSquares()),
     Case("delta, MAP", "linear-delta", "component", 20, MAP()),
-    Case(
-        "hexapod, noise twice its sigma",
-        "hexapod-42",
-        "pose",
-        20,
-        LeastSquares(),
-        noise=2.0,
-    ),
+    Case("hexapod, noise twice its sigma", "hexapod-42", "pose", 20, LeastSquares(), noise=2.0),
 )
 
 
