@@ -14,7 +14,7 @@ from tempfile import TemporaryDirectory
 
 import loopcal as lc
 from loopcal.io.robot.robot_file import list_shipped_robots
-from loopcal.report.figures.robot_figure import draw_robot
+from loopcal.report.scene.scene import draw_robot
 
 ROOT = Path(__file__).resolve().parent.parent
 PICTURES = ROOT / "docs" / "pictures"

@@ -16,7 +16,12 @@ __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 name_presenters(
     page=["loopcal.report.calibration_view", "loopcal.report.validation_view"],
     figure=[
-        f"loopcal.report.figures.{module}"
-        for module in ("fit_figures", "plan_figures", "result_figures", "robot_figure")
+        f"loopcal.report.{module}"
+        for module in (
+            "figures.fit_figures",
+            "figures.plan_figures",
+            "figures.result_figures",
+            "scene.scene",
+        )
     ],
 )

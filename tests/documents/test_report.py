@@ -20,7 +20,7 @@ from loopcal.documents import load_record
 from loopcal.errors import DataError, FileError
 from loopcal.report.calibration_view import build_budget_table, build_share_table
 from loopcal.report.document import figures
-from loopcal.report.document.calibration_document import build_calibration_document, build_sections
+from loopcal.report.document.documents import build_calibration_document, build_sections
 from loopcal.report.document.elements import Document, Picture, render_html
 from loopcal.report.document.figures import thin_rows
 from loopcal.report.scene.scene import load_script

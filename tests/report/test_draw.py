@@ -8,9 +8,8 @@ from loopcal.cli.entry_point import main
 from loopcal.errors import FileError
 from loopcal.io.core.text_file import write_bytes
 from loopcal.io.robot.robot_file import load_robot
-from loopcal.report.figures.robot_figure import draw_robot
 from loopcal.report.pictures import save_figure
-from loopcal.report.scene.scene import list_parts
+from loopcal.report.scene.scene import draw_robot, list_parts
 from tests import zoo
 
 

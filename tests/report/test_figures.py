@@ -26,9 +26,9 @@ from loopcal.report.figures.fit_figures import (
 )
 from loopcal.report.figures.plan_figures import draw_plan
 from loopcal.report.figures.result_figures import draw_accuracy_map, draw_validation
-from loopcal.report.figures.robot_figure import draw_robot
 from loopcal.report.figures.style import label_poses, shorten, start_figure
 from loopcal.report.pictures import render_figure
+from loopcal.report.scene.scene import draw_robot
 
 OF_FITS = [draw_residuals, draw_parameters, draw_correlation, draw_convergence]
 WITHOUT_UNIT = {"", "pose"}

@@ -9,8 +9,8 @@ from matplotlib.text import Text
 from loopcal.io.core.text_file import write_bytes
 from loopcal.io.core.yaml_file import parse_yaml
 from loopcal.io.robot.robot_file import build_robot, find_robot_file
-from loopcal.report.figures.robot_figure import draw_robot
 from loopcal.report.pictures import FORMATS, save_figure
+from loopcal.report.scene.scene import draw_robot
 
 NAMES = ["$\\frac{", "$x$", "<b>&amp;>", "100 % {0}"]
 

@@ -149,8 +149,8 @@ def check(
 
     inspection = inspect_robot(opt.open_robot(robot, (plot,), (), force))
     if plot is not None:
-        from loopcal.report.figures.robot_figure import draw_robot
         from loopcal.report.pictures import save_figure
+        from loopcal.report.scene.scene import draw_robot
 
         save_figure(plot, draw_robot(inspection.robot), write=write_bytes)
 

@@ -27,7 +27,6 @@ from loopcal.report.figures.result_figures import (
     draw_height_errors,
     draw_validation,
 )
-from loopcal.report.figures.robot_figure import draw_scene
 from loopcal.report.pictures import inline_figure
 from loopcal.report.scene.scene import (
     Motion,
@@ -35,6 +34,7 @@ from loopcal.report.scene.scene import (
     choose_rows,
     compute_motion,
     compute_pose_errors,
+    draw_scene,
     format_scene,
 )
 from loopcal.report.words import say
