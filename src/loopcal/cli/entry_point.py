@@ -44,7 +44,7 @@ SECTIONS = {
     },
     "Prepare measurements": {
         "identifiability": ("measurement", "Show which parameters measurements determine."),
-        "plan": ("plan", "Plan which poses to measure, and write a sheet for them."),
+        "plan": ("measurement", "Plan which poses to measure, and write a sheet for them."),
         "gcode": ("exchange", "Write a program that moves a machine to the poses of a plan."),
         "fill": ("exchange", "Fill in the sheet of a plan from the export of an instrument."),
         "board": ("picture", "Draw a board to print, for pictures by a phone or camera."),
@@ -71,10 +71,10 @@ SECTIONS = {
     },
     "Examine the uncertainty": {
         "bootstrap": (
-            "sampling",
+            "calibration",
             "Resample a calibration and compare the scatter with its intervals.",
         ),
-        "sample": ("sampling", "Draw from the exact posterior of a calibration."),
+        "sample": ("calibration", "Draw from the exact posterior of a calibration."),
     },
     "Simulate many calibrations": {
         "study": ("study", "Compare instruments, numbers of poses and methods by simulation.")
