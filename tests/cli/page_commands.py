@@ -4,7 +4,7 @@
 `run_page` executes a page from top to bottom in the present folder. Its conventions:
 
 * Each line of an `sh` block is a command of loopcal, with exit code 0 or with the one in its
-  comment (`# exit code 2`).
+  comment (`# exit code 2`). `< FILE` at its end is its standard input.
 * All `python` blocks share their names; those that begin with `>>>` also show what they print.
 * A `text` block below them has lines of what the commands and the code above it have printed, in
   this order; `...` stands for lines that are left out.
@@ -21,6 +21,8 @@ import shlex
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+import pytest
 
 from loopcal.cli.entry_point import main
 
@@ -87,7 +89,15 @@ def run_command(line: str) -> str:
     """Run one command of a page; return what it printed, notes and errors included."""
     words, expected = shlex.split(line, comments=True), re.search(r"# exit code (\d)", line)
     assert words[0] == "loopcal", line
-    with contextlib.redirect_stdout(io.StringIO()) as out, contextlib.redirect_stderr(out):
+    typed = ""
+    if "<" in words:
+        typed, words = Path(words[-1]).read_text("utf-8"), words[:-2]
+    with (
+        contextlib.redirect_stdout(io.StringIO()) as out,
+        contextlib.redirect_stderr(out),
+        pytest.MonkeyPatch.context() as patch,
+    ):
+        patch.setattr("sys.stdin", io.StringIO(typed))
         code = main(words[1:])
     assert code == (int(expected[1]) if expected else 0), f"{line}\n{out.getvalue()}"
     return out.getvalue()

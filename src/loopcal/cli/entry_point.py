@@ -46,6 +46,7 @@ SECTIONS = {
         "identifiability": ("measurement", "Show which parameters measurements determine."),
         "plan": ("measurement", "Plan which poses to measure, and write a sheet for them."),
         "gcode": ("exchange", "Write a program that moves a machine to the poses of a plan."),
+        "measure": ("session", "Measure the poses of a plan with a companion."),
         "fill": ("exchange", "Fill in the sheet of a plan from the export of an instrument."),
         "board": ("picture", "Draw a board to print, for pictures by a phone or camera."),
         "photos": ("picture", "Find the corners of a printed board in pictures."),

@@ -322,3 +322,21 @@ class PlanOptions(PlanSettings):
             poses = np.atleast_2d(np.array(self.allowed_poses, dtype=float))
             poses.setflags(write=False)
             object.__setattr__(self, "allowed_poses", poses)
+
+    @property
+    def asked(self) -> dict[str, Any]:
+        """What the poses of the plan are for; see `restore_options`."""
+        return {name: getattr(self, name) for name in ASKED}
+
+
+ASKED = ("target", "goal", "share", "frame", "constraints")
+"""Options that a session of measuring the plan needs."""
+
+
+def restore_options(asked: Mapping[str, Any]) -> PlanOptions:
+    """Return the options of a plan from the JSON of what was asked for."""
+    of_plan = {name: value for name, value in asked.items() if name in ASKED}
+    stated = {name: v for name, v in of_plan.get("constraints", {}).items() if v is not None}
+    if "sight" in stated:  # null stands for an infinite distance
+        stated["sight"] = LineOfSight(**{k: v for k, v in stated["sight"].items() if v is not None})
+    return PlanOptions(**{**of_plan, "constraints": Constraints(**stated)})

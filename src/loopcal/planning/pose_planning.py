@@ -168,6 +168,7 @@ class Plan(DrawnResult):
         *fields(frame=lambda plan: str(plan.errors.frame)),
         *fields(expected=lambda plan: to_json(plan.errors)),
         *fields(path_length="poses.path_length", seed="options.seed"),
+        *fields(asked=lambda plan: to_json(plan.options.asked)),
         *fields(poses=lambda plan: plan.poses.to_dicts(plan.robot)),
         *fields(compared=lambda plan: plan.list_compared(), curve=""),
         *fields(notes=lambda plan: list(map(str, plan.notes)), findings=""),

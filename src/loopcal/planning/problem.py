@@ -289,9 +289,14 @@ class PlanningProblem:
 
 
 def prepare_problem(
-    robot: Mechanism, instrument: Instrument, options: PlanOptions | None = None
+    robot: Mechanism,
+    instrument: Instrument,
+    options: PlanOptions | None = None,
+    candidates: Candidates | None = None,
 ) -> PlanningProblem:
     """Return the planning problem of a robot, at its present values, and an instrument.
+
+    candidates : poses to choose from; by default those of the options, drawn or listed.
 
     Errors are predicted for PREDICTED poses drawn evenly from the workspace within the machine's
     own limits, wherever the constraints allow measuring. With allowed poses in the options, they
@@ -306,10 +311,10 @@ def prepare_problem(
     _require_plain_sensors(instrument)
     check_closure(robot, [sensor.kind for sensor in instrument.sensors], None, 1)
     rng = np.random.default_rng(options.seed)
-    if options.allowed_poses is None:
-        candidates = draw_candidates(robot, options.constraints, options.n_candidates, rng)
-    else:
+    if candidates is None and options.allowed_poses is not None:
         candidates = check_listed_poses(robot, options.allowed_poses, options.constraints)
+    elif candidates is None:
+        candidates = draw_candidates(robot, options.constraints, options.n_candidates, rng)
     mounted, measured = instrument.with_tool(robot), options.measured
     groups = linearize_candidate_groups(free, mounted, candidates.solution.q, rng)
     observable = decompose_information(groups)

@@ -42,6 +42,7 @@ FILES: Mapping[str, tuple[str, ...]] = {
     "sampling": ("sampling",),
     "studies": ("study",),
     "plan": ("plan",),
+    "companion": ("companion", "session"),
     "sheets": ("sheet",),
     "pictures": ("pictures",),
     "study_folders": ("store", "workers"),

@@ -92,7 +92,9 @@ class Line:
     header: Header | None
 
 
-def read_lines(path: Path, profile: Profile, clock: PatternClock) -> tuple[list[Line], int]:
+def read_lines(
+    path: Path, profile: Profile, clock: PatternClock, content: bytes | None = None
+) -> tuple[list[Line], int]:
     """Return the lines of an export that may be rows, and the number of lines without data: headers
     and those that the profile skips. FileError : unreadable, empty, or without the header.
     """
@@ -102,7 +104,7 @@ def read_lines(path: Path, profile: Profile, clock: PatternClock) -> tuple[list[
     named = {place for place in (*sources, *record.matrix) if isinstance(place, str)}
     lines: list[Line] = []
     header, nearest, skipped = None, None, 0
-    text = _decode(path, profile).replace("\r\n", "\n").replace("\r", "\n")
+    text = _decode(path, profile, content).replace("\r\n", "\n").replace("\r", "\n")
     TABLE_ROWS.check(text.count("\n"), "export", path)
     for number, line in enumerate(text.split("\n"), 1):
         LINE_LENGTH.check(len(line), "export", path, number)
@@ -200,9 +202,9 @@ def _count_cells(count: int) -> str:
     return f"{count} cell{'' if count == 1 else 's'}"
 
 
-def _decode(path: Path, profile: Profile) -> str:
+def _decode(path: Path, profile: Profile, content: bytes | None) -> str:
     """Return the text of the export."""
-    raw = read_bytes(path, "export", TABLE_SIZE)
+    raw = read_bytes(path, "export", TABLE_SIZE) if content is None else content
     act = "Give its 'encoding' in the profile"
     try:
         text = raw.decode(profile.encoding)
@@ -371,15 +373,19 @@ class Conversion:
 
 
 def convert_export(
-    path: str | Path, profile: Profile, pattern_seconds: float = PATTERN_SECONDS.most
+    path: str | Path,
+    profile: Profile,
+    pattern_seconds: float = PATTERN_SECONDS.most,
+    content: bytes | None = None,
 ) -> Conversion:
     """Convert an export; the patterns of the profile may take `pattern_seconds`, else FileError.
 
+    content : the part of the export to convert; by default the whole file.
     FileError : unreadable, without the header that the profile needs, or no line fits.
     """
     path = as_path(path, "export")
     clock = PatternClock(profile.file, pattern_seconds)
-    read, skipped = read_lines(path, profile, clock)
+    read, skipped = read_lines(path, profile, clock, content)
     fitting, misfits = [], []
     for line in read:
         try:
@@ -566,7 +572,7 @@ def fill_sheet(
     by_order : join points by their order, not by their names.
     FileError : a file cannot be read, or no name or another number of points matches.
     """
-    table, entry = _read_sheet(Path(sheet), robot)
+    table, entry = read_sheet(Path(sheet), robot)
     columns = [column.name for column in entry.kind.columns]
     targets = tuple(getattr(entry.kind, "targets", ())) or ("",)
     filled: dict[str, list[Row]] = {}
@@ -576,14 +582,14 @@ def fill_sheet(
     identical: list[str] = []
     has_sessions, poses = len(exports) > 1 and not has_one_session, set(table.pose_names())
     for export in exports:
-        of_export, rows = _read_points(Path(export), profile, entry, table, by_order, misfits)
+        of_export, rows = read_points(Path(export), profile, entry, by_order, misfits)
         for name, unit in of_export.items():  # the profile is one
             if units.setdefault(name, unit) != unit:
                 sentence = f"column {name!r} has another unit than in the first export"
                 raise FileError(sentence, Path(export))
         if has_sessions:
             units.setdefault("session", None)
-        for pose, row in rows:
+        for pose, row in _name_rows(rows, entry, table, by_order, Path(export)):
             if pose not in poses:
                 unknown += [name_point(pose, t, targets) for t in _list_measured(row, targets)]
                 continue
@@ -605,19 +611,26 @@ def fill_sheet(
     # columns of the sheet, measured ones with the unit of the export, then further ones
     header = {n: units.get(n, u) if n in columns else u for n, u in table.units.items()}
     header |= {name: unit for name, unit in units.items() if name not in header}
-    data = _read_measurements(robot, table, body, header)
+    data = read_rows(robot, table, body, header)
     source = " and ".join(map(str, exports))  # the file whose values a check doubts
     data = replace(data, observations=tuple(replace(o, source=source) for o in data.observations))
-    above = read_text(table.path, "sheet").lstrip("\ufeff").splitlines()[: table.header_line - 1]
-    lines = [line for line in above if line.strip()]
-    cells = tuple(tuple(row.get(name, "") for name in header) for row in body)
-    written = (format_header(header), *cells)
-    text = "\n".join([*lines, *map(format_row, written)]) + "\n"
+    text, written = format_rows(table, body, header)
     unit = next((units.get(name) for name in columns if units.get(name)), None) or "mm"
     return FilledSheet(text, written, tuple(misfits), data, unit, tuple(findings))
 
 
-def _read_sheet(path: Path, robot: Mechanism) -> tuple[Table, KindRows]:
+def format_rows(
+    table: Table, body: Sequence[Row], header: Mapping[str, str | None]
+) -> tuple[str, tuple[tuple[str, ...], ...]]:
+    """Return the measurement file of rows with the settings of a sheet: its text, and its cells."""
+    above = read_text(table.path, "sheet").lstrip("\ufeff").splitlines()[: table.header_line - 1]
+    lines = [line for line in above if line.strip()]
+    cells = tuple(tuple(row.get(name, "") for name in header) for row in body)
+    written = (format_header(header), *cells)
+    return "\n".join([*lines, *map(format_row, written)]) + "\n", written
+
+
+def read_sheet(path: Path, robot: Mechanism) -> tuple[Table, KindRows]:
     """Return the sheet and its only kind; FileError where it has measured values or other rows."""
     table = read_table(path)
     require_columns(table, ("pose",), "to join the points of an export with")
@@ -631,15 +644,17 @@ def _read_sheet(path: Path, robot: Mechanism) -> tuple[Table, KindRows]:
     return table, kinds[0]
 
 
-def _read_points(
+def read_points(
     export: Path,
     profile: Profile,
     entry: KindRows,
-    table: Table,
     by_order: bool,
     misfits: list[tuple[str, int, str]],
-) -> tuple[Mapping[str, str | None], list[tuple[str, Row]]]:
-    """Return the units of the columns of an export, and its rows by pose; add its misfits."""
+    content: bytes | None = None,
+) -> tuple[Mapping[str, str | None], list[Row]]:
+    """Return the units of the columns of an export, or of its `content` so far, and its rows; add
+    its misfits.
+    """
     kind, record = entry.kind, replace(profile.record, settings={})
     targets = tuple(getattr(kind, "targets", ()))
     if by_order:
@@ -649,30 +664,37 @@ def _read_points(
             kind = replace(kind, targets=("point",), places=None)  # pyright: ignore[reportCallIssue]
     mine = replace(profile, record=record, kind=kind)
     check_columns(mine)
-    conversion = convert_export(export, mine)
+    conversion = convert_export(export, mine, content=content)
     misfits += [(str(export), line, reason) for line, reason in conversion.misfits]
     units = {name: unit for name, unit in list_headers(mine).items() if name != "pose"}
     rows = [dict(zip(("pose", *units), cells, strict=True)) for cells in conversion.table[1:]]
+    if not by_order or len(targets) < 2:
+        return units, rows
+    k, measured = len(targets), {column.name for column in kind.columns}
+    own: dict[str, str | None] = {}
+    for i, row in enumerate(rows):
+        named = {n: f"{targets[i % k]}.{n}" if n in measured else n for n in units}
+        own |= {named[name]: unit for name, unit in units.items()}
+        rows[i] = {named[name]: row[name] for name in units}
+    return own, rows
+
+
+def _name_rows(
+    rows: Sequence[Row], entry: KindRows, table: Table, by_order: bool, export: Path
+) -> list[tuple[str, Row]]:
+    """Return the rows of an export by pose; FileError where their number differs from the sheet."""
     if not by_order:
-        return units, [(row.pop("pose"), row) for row in rows]
-    poses, k = table.pose_names(), max(len(targets), 1)
+        return [(row.pop("pose"), row) for row in rows]
+    poses, k = table.pose_names(), max(len(getattr(entry.kind, "targets", ())), 1)
     if len(rows) != len(poses) * k:
         wanted, count = len(poses) * k, len(rows)
         code = "sheet.count-differs"
         raise FileError(
             report_finding(code, wanted=wanted, poses=len(poses), targets=k, count=count), export
         )
-    measured = {column.name for column in kind.columns}
-    own: dict[str, str | None] = {}
-    named: list[tuple[str, Row]] = []
-    for i, row in enumerate(rows):
-        of_target = {
-            name: f"{targets[i % k]}.{name}" if k > 1 and name in measured else name
-            for name in units
-        }
-        own |= {of_target[name]: unit for name, unit in units.items()}
-        named.append((poses[i // k], {of_target[name]: row[name] for name in units}))
-    return own, named
+    return [
+        (poses[i // k], {n: c for n, c in row.items() if n != "pose"}) for i, row in enumerate(rows)
+    ]
 
 
 def _add_row(rows: list[Row], row: Row, columns: Sequence[str]) -> bool:
@@ -745,13 +767,13 @@ def _merge(
             yield {**dict.fromkeys(units, ""), **kept, **{n: c for n, c in points.items() if c}}
 
 
-def _read_measurements(
+def read_rows(
     robot: Mechanism, table: Table, body: Sequence[Row], header: dict[str, str | None]
 ) -> Measurements:
     """Return the measurements of a filled sheet, without the poses that have no measured value."""
     lines = dict(zip(table.pose_names(), table.lines, strict=True))
     columns = {name: Cells(["\n".join(row.get(name, "") for row in body)]) for name in header}
-    of_rows = tuple(lines[pose] for pose in columns["pose"])
+    of_rows = tuple(lines.get(pose, table.header_line) for pose in columns["pose"])
     filled = replace(table, units=header, columns=columns, lines=of_rows)
     others = read_tables(table.path)[1:]
     data = join_tables((filled, *others), robot, allow_outside_stroke=True, allow_duplicates=True)

@@ -62,9 +62,7 @@ def read_stops(path: str | Path, robot: Mechanism) -> Stops:
         if use not in (FIT, HELD_OUT, VIA):
             raise table.row_error(row, f"the use {use!r} is not {FIT}, {HELD_OUT} or {VIA}")
     columns = [table.numbers(n, get_dimension(n), empty=False) for n in robot.controlled]
-    if others := tuple(name for name in robot.controlled if name not in WORDS):
-        code = "files.no-gcode-word"
-        raise DataError(report_finding(code, robot=robot.name, names=others, words=tuple(WORDS)))
+    _require_words(robot)
     return table.pose_names(), uses, np.column_stack(columns)
 
 
@@ -93,13 +91,8 @@ def format_gcode(
     shown_feed = format_positive("feed", feed * 60.0 / find_unit(unit).factor_to_si, f"{unit}/min")
     wait = "M0" if pause is None else f"G4 P{format_positive('pause', pause, 's')}"
 
-    symbols = {Dimension.LENGTH: unit, Dimension.ANGLE: "deg"}
-    factors = [find_unit(symbols[get_dimension(name)]).factor_to_si for name in robot.controlled]
-
     def move(coordinates: FloatArray) -> str:
-        triples = zip(robot.controlled, coordinates.tolist(), factors, strict=True)
-        words = (f"{WORDS[name]}{format_short(value / f, DECIMALS)}" for name, value, f in triples)
-        return f"G53 G1 {' '.join(words)} F{shown_feed}"
+        return f"{format_move(robot, coordinates, unit)} F{shown_feed}"
 
     lines = [
         f"({_clean(robot.name)}: {poses} poses of a plan, in its order, and back to home)",
@@ -123,6 +116,25 @@ def format_gcode(
         lines += [f"(pose {_clean(label)})", move(coordinates)]
         lines += [f"(MSG, measure pose {_clean(label)})", wait]
     return "\n".join([*lines, "(back to home)", move(home), "M2"]) + "\n"
+
+
+def format_move(robot: Mechanism, coordinates: FloatArray, unit: Literal["mm", "in"]) -> str:
+    """Return a straight move to controlled coordinates (c,) [m, rad], without a feed; DataError
+    where one has no word.
+    """
+    _require_words(robot)
+    symbols = {Dimension.LENGTH: unit, Dimension.ANGLE: "deg"}
+    factors = [find_unit(symbols[get_dimension(name)]).factor_to_si for name in robot.controlled]
+    triples = zip(robot.controlled, coordinates.tolist(), factors, strict=True)
+    words = (f"{WORDS[name]}{format_short(value / f, DECIMALS)}" for name, value, f in triples)
+    return f"G53 G1 {' '.join(words)}"
+
+
+def _require_words(robot: Mechanism) -> None:
+    """Raise DataError where a controlled coordinate has no word."""
+    if others := tuple(name for name in robot.controlled if name not in WORDS):
+        code = "files.no-gcode-word"
+        raise DataError(report_finding(code, robot=robot.name, names=others, words=tuple(WORDS)))
 
 
 def _clean(text: str) -> str:

@@ -15,16 +15,17 @@ measured.
 from __future__ import annotations
 
 import csv
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from loopcal.errors import FileError
 from loopcal.io.core.csv_table import format_row, parse_exact
 from loopcal.io.core.outputs import FolderKind
+from loopcal.io.core.text_file import read_json
 from loopcal.io.data.columns import COMMANDED, FIT, HELD_OUT, USE_COLUMN
 from loopcal.io.data.measurement_file import format_data_sheet, format_measurements
 from loopcal.mechanism.model import Mechanism
@@ -114,6 +115,30 @@ def find_plan_sheet(data: Path) -> Path:
         sentence = f"this sheet has no readings, and its folder lacks {SHEET}"
         raise FileError(f"{sentence}. Fill in the readings, or name the file in its plan", data)
     return beside
+
+
+def _read_plan(sheet: Path) -> Mapping[str, Any]:
+    """Return the document of the plan that a sheet belongs to; empty where there is none."""
+    path = sheet.parent / RESULT
+    document = read_json(path, "plan", "repeat the command") if path.is_file() else {}
+    return document if isinstance(document, dict) else {}
+
+
+def find_plan_robot(sheet: Path) -> str:
+    """Return the robot file that a plan was made for; FileError where it is not known."""
+    made_by = _read_plan(sheet).get("made_by", {})
+    path = made_by.get("inputs", {}).get("robot", {}).get("path", "")
+    if not Path(path).is_file():
+        sentence = "the plan of this sheet does not name its robot file"
+        if path:
+            sentence = f"the robot file {path} of this plan does not exist"
+        raise FileError(f"{sentence}. Name the robot", sheet)
+    return str(path)
+
+
+def find_asked(sheet: Path) -> Mapping[str, Any]:
+    """Return what a plan was asked for, see `loopcal.planning.constraints.restore_options`."""
+    return dict(_read_plan(sheet).get("asked", {}))
 
 
 def _list_columns(robot: Mechanism) -> tuple[list[str], list[float]]:
