@@ -229,8 +229,9 @@ class Predictor(NamedTuple):
         values = np.array([[self.values[name] for name in table.names]]).reshape(1, -1)
         total = problem.poses.count_rows(member, int(member.max(initial=-1)) + 1)
         noise = 1.0 if self.uncertainty is None else self.uncertainty.noise_scale
-        for *names, columns, r in iterate_blocks(problem.rows_at(z, values), member, total):
-            yield *names, columns / noise, r / noise
+        rows = problem.rows_at(z, values)
+        for blocks, unknowns, columns, r in iterate_blocks(rows, member, total):
+            yield blocks, unknowns, columns / noise, r / noise
 
     def iterate_rows(
         self, data: Measurements, member: IntArray

@@ -83,12 +83,13 @@ def list_observed_values(linear: FitLinearization, clusters: Clusters) -> Observ
     links = max(rows.poses_by_link.shape[1] for rows in problem.rows)
     parts, coordinates = [], []
     for block, poses in problem.poses.iterate_poses(solution, z):
-        for i, (numbers, rows) in enumerate(zip(block.row_numbers, block.rows, strict=True)):
-            of_kind = problem.rows[i]
-            place, component = np.nonzero(of_kind.is_present[0, numbers])
+        for i, (of_kind, rows) in enumerate(zip(problem.rows, block.rows, strict=True)):
+            place, column = np.nonzero(rows.is_present[0])
             if not len(place):
                 continue
-            own, row = linearize_rows(rows, poses, trials, fixed), numbers[place]
+            row, columns = block.locate(i, place)
+            component = columns[np.arange(len(place)), column]
+            own = linearize_rows(rows, poses, trials, fixed)
             by_parameters = own.by_parameters[0]
             by_nuisance = np.zeros((*by_parameters.shape[:2], len(root)))
             if own.by_nuisance is not None and estimate is not None:
@@ -99,14 +100,14 @@ def list_observed_values(linear: FitLinearization, clusters: Clusters) -> Observ
             parts.append(
                 (
                     *(clusters.member[of_kind.first_poses[row]], np.full(len(row), i)),
-                    *(row, component, own.residual[0][place, component]),
-                    *(by_nuisance[place, component], by_parameters[place, component]),
+                    *(row, component, own.residual[0][place, column]),
+                    *(by_nuisance[place, column], by_parameters[place, column]),
                     seen[:, np.minimum(np.arange(links), seen.shape[1] - 1)],
                 )
             )
             coordinates.append(np.zeros((len(row), 1, 0)))
             if own.by_coordinates is not None:
-                coordinates[-1] = own.by_coordinates[0][place, :, component]
+                coordinates[-1] = own.by_coordinates[0][place, :, column]
     columns: list[Any] = [np.concatenate(arrays) for arrays in zip(*parts, strict=True)]
     by_coordinates = np.zeros((len(columns[0]), links, max(c.shape[2] for c in coordinates)))
     first = 0

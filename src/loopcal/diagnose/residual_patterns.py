@@ -200,9 +200,9 @@ def collect_rows(
     for node_rows in problem.leverage_rows(linearization, solution):
         for part in node_rows:
             present = np.diagonal(observations[part.kind].whitener, axis1=1, axis2=2) != 0.0
-            i, column = np.nonzero(present[part.numbers])
+            i, own = np.nonzero(present[part.numbers[:, None], part.columns])
             kind, w = np.full(len(i), part.kind), part.unknowns.shape[1]
-            rows = part.rows[i, column]
+            rows, column = part.rows[i, own], part.columns[i, own]
             moved.append((rows[:, :w], part.unknowns[i]))
             groups.append((rows[:, w:], kind, part.numbers[i], column))
     if not groups:

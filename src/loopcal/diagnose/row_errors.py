@@ -458,7 +458,13 @@ class PosePredictions:
                 sizes.append(np.zeros(len(o)))
                 continue
             moved = o.whitener @ by_setup[0] * (1.0 if factor is None else factor[:, None])
-            together = np.linalg.norm(np.matmul(moved, root[used]), axis=(1, 2))
+            together = np.zeros(len(o))
+            sets, set_of = np.unique(used, axis=0, return_inverse=True)
+            order = np.argsort(set_of.ravel(), kind="stable")
+            parts = np.split(order, np.cumsum(np.bincount(set_of.ravel()))[:-1])
+            for own, mine in zip(sets, parts, strict=True):
+                part = root[own][:, root[own].any(axis=0)]  # of its session
+                together[mine] = np.linalg.norm(moved[mine] @ part, axis=(1, 2))
             most = np.linalg.norm(moved * alone[used][:, None], axis=(1, 2))
             sizes.append(np.where(together > SMALLEST_EFFECT * most, together, 0.0))
         return sizes

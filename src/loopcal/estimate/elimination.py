@@ -22,6 +22,7 @@ from loopcal.estimate.linearization import KindRows
 from loopcal.estimate.observation_rows import ObservationRows
 from loopcal.measure.nuisance import NuisanceParameters
 from loopcal.numerics.elimination import (
+    TARGET,
     EliminationTree,
     NodeFactors,
     TreeElimination,
@@ -165,7 +166,12 @@ def plan_elimination(
     if not len(local):
         return None
     is_free = np.asarray(local.table.free, dtype=bool)
-    tree = build_tree(is_free, [p.scope for p in local.table.entries], _sets(rows, member))
+    scopes = [p.scope for p in local.table.entries]
+    if member is None:  # rows of poses with coordinates are eliminated together
+        for i in (i for r in rows for i in r.list_target_parameters().tolist()):
+            scopes[i] = TARGET
+        rows = [r.divided() for r in rows]
+    tree = build_tree(is_free, scopes, _sets(rows, member))
     has_prior = is_free & ~np.isnan(local.table.tolerance)
     return NuisanceElimination(local, tree, is_free, has_prior, local.table.nominal[None])
 

@@ -297,9 +297,8 @@ def fold_sources(
         kinds = poses.linearize_kinds(block, linearized, problem.trials, fixed)
         for source in range(count):
             own = [
-                np.broadcast_to(own, (len(numbers), *own.shape[1:]))
-                for of, numbers in zip(sources, block.row_numbers, strict=True)
-                for own in [find_share(of, source, numbers)]
+                _take_share(find_share(of, source, numbers), len(numbers), len(rows.poses))
+                for of, numbers, rows in zip(sources, block.row_numbers, block.rows, strict=True)
             ]
             if not any(rows.any() for rows in own):
                 continue
@@ -365,6 +364,15 @@ def _select_rows(
         left = own_rows[..., width:] - own_rows[..., :width] @ solved
         chosen.append(NodeRows(group.structure, group.nodes, group.components, left))
     return chosen
+
+
+def _take_share(share: FloatArray, count: int, divided: int) -> FloatArray:
+    """Return the roots of `divided` rows of targets from those (r | 1, m, m) of `count` rows."""
+    k, m = max(divided // max(count, 1), 1), share.shape[1]
+    if m > 1:
+        share = np.einsum("rkikj->rkij", share.reshape(len(share), k, m // k, k, m // k))
+    share = share.reshape(len(share), -1, *share.shape[-2:])
+    return np.broadcast_to(share, (count, k, *share.shape[2:])).reshape(divided, *share.shape[2:])
 
 
 def _weigh(kind: KindRows, root: FloatArray) -> KindRows:

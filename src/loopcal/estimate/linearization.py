@@ -115,6 +115,7 @@ class LeverageRows(NamedTuple):
         these (`TreeElimination.roots`); the next p are those of the machine as the nuisance
         parameters follow it; the last are residuals.
     kind : number of the kind; -1 where they are of several. numbers : (k,) rows of the kind.
+        columns : (k, m) which of its residuals they are.
     """
 
     poses: IntArray
@@ -122,6 +123,7 @@ class LeverageRows(NamedTuple):
     rows: FloatArray
     kind: int
     numbers: IntArray
+    columns: IntArray
 
     def spread(self, count: int) -> FloatArray:
         """Return the rows (k, m, U + p + 1) by all U nuisance parameters."""

@@ -10,9 +10,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from loopcal.measure.array_checks import drop_repeats
 from loopcal.measure.kinds.kind import Kind, MeasuredColumns
 from loopcal.measure.measurements import Measurements
 from loopcal.numerics.elimination import find_connected_groups
+from loopcal.numerics.statistics import find_distinct
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
 TRIAL_BLOCK = 16384
@@ -68,6 +70,41 @@ class ObservationRows:
         factor = None if self.factor is None else self.factor[rows]
         offset = None if self.offset is None else self.offset[:, rows]
         return ObservationRows(self.kind, place[self.poses[rows]], *selected, factor, offset)
+
+    def divided(self) -> ObservationRows:
+        """Return the rows of each target on its own, (r k, ..), where the noise allows it: they
+        move their own place and what all share, and no other target.
+        """
+        if (done := self.kind.divide()) is None or self.kind.is_of_base:
+            return self
+        (kind, places), (t, r, m) = done, self.whitener.shape[:3]
+        k = len(places)
+        white = drop_repeats(self.whitener)
+        parts = white.reshape(*white.shape[:2], k, m // k, k, m // k)
+        own = np.einsum("trkikj->trkij", parts)
+        if np.count_nonzero(own) != np.count_nonzero(white):  # errors that targets share
+            return self
+        white = np.broadcast_to(own, (t if len(white) > 1 else 1, r, *own.shape[2:]))
+        offset = self.offset
+        return ObservationRows(
+            kind,
+            self.poses.repeat(k, axis=0),
+            self.measured.reshape(len(self.measured), r * k, -1),
+            white.reshape(len(white), r * k, m // k, m // k),
+            self.nuisance[:, places].reshape(r * k, -1),
+            None if self.factor is None else self.factor[:, places].reshape(r * k, -1),
+            None if offset is None else offset.reshape(len(offset), r * k, -1),
+        )
+
+    def list_target_parameters(self) -> IntArray:
+        """Return the nuisance parameters that only the rows of one target use, where rows are
+        `divided`.
+        """
+        done = self.kind.divide()
+        if done is None or self.divided() is self:
+            return np.zeros(0, dtype=np.int64)
+        own = done[1][:, (done[1] != done[1][:1]).any(axis=0)]
+        return find_distinct(self.nuisance[:, own.ravel()])
 
     def cut_trials(self, trials: IntArray) -> ObservationRows:
         """Return the rows of some trials (a,), which are numbered from 0 then."""

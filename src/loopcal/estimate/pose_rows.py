@@ -616,7 +616,8 @@ class PoseBlock:
     """Some poses and the rows that observed them.
 
     poses : (b,) numbers of the poses.
-    row_numbers : of every kind, (k,). rows : of every kind, poses numbered within the block.
+    row_numbers : of every kind, (k,). rows : of every kind, poses numbered within the block; where
+        poses have no coordinates those of each target on its own, see `ObservationRows.divided`.
     is_needed : (b,) poses that some row needs.
     members : of every kind, its rows by nodes where poses have no coordinates. groups : of
         components, whose coordinates are eliminated before their rows go to the nodes.
@@ -628,6 +629,12 @@ class PoseBlock:
     is_needed: BoolArray
     members: tuple[tuple[NodeMembers, ...], ...] = ()
     groups: tuple[ComponentGroup, ...] = ()
+
+    def locate(self, kind: int, numbers: IntArray) -> tuple[IntArray, IntArray]:
+        """Return the rows (n,) of a kind, and their residuals (n, m), that some of `rows` are."""
+        whole, m = self.row_numbers[kind], self.rows[kind].whitener.shape[-1]
+        k = max(len(self.rows[kind].poses) // max(len(whole), 1), 1)
+        return whole[numbers // k], (numbers % k * m)[:, None] + np.arange(m)
 
 
 def divide_into_runs(
@@ -644,7 +651,7 @@ def divide_into_runs(
     ]
 
     def add(poses: IntArray, chosen: tuple[IntArray, ...]) -> None:
-        own = _take_rows(rows, poses, chosen, n)
+        own = tuple(r.divided() for r in _take_rows(rows, poses, chosen, n))
         members = tuple(list_members(nuisance, r) for r in own)
         blocks.append(PoseBlock(poses, chosen, own, is_needed[poses], members))
 

@@ -101,9 +101,11 @@ def spread_rows(
             moved, rows = rows[..., : -p - 1], rows[..., -p - 1 :].copy()
             rows[..., :-1] += moved @ slope
             rows = np.concatenate([moved @ root, rows], axis=2)
-        is_left = part.kind < 0  # rows of components, whose poses are eliminated
-        first = poses.first_pose if is_left else block.poses[block.rows[part.kind].first_poses]
-        yield LeverageRows(first[part.numbers], path, rows, part.kind, part.numbers)
+        first, numbers, columns = poses.first_pose, part.numbers, np.zeros((0, 0), dtype=np.int64)
+        if part.kind >= 0:  # else rows of components, whose poses are eliminated
+            first = block.poses[block.rows[part.kind].first_poses]
+            numbers, columns = block.locate(part.kind, part.numbers)
+        yield LeverageRows(first[part.numbers], path, rows, part.kind, numbers, columns)
 
 
 CONTROL = Halving(steps=10, attempts=10, relative=0.0, absolute=1e-9, stuck=1e-3)
@@ -388,8 +390,10 @@ class Problem:
                 evaluated, white = evaluate_rows(rows, poses, self.trials, solution.nuisance)
                 ok = np.all(poses.is_reached[:, rows.poses_by_link], axis=2, keepdims=True)
                 raw = np.where(ok, evaluated.residual, np.nan)
-                kind.raw[:, numbers] = raw
-                kind.whitened[:, numbers] = rows.whiten(white, raw, self.trials)
+                shape = len(raw), len(numbers), -1
+                kind.raw[:, numbers] = raw.reshape(shape)
+                whitened = rows.whiten(white, raw, self.trials)
+                kind.whitened[:, numbers] = whitened.reshape(shape)
                 evaluations.append(evaluated)
             if observe is not None:
                 observe(i, poses, evaluations)

@@ -142,7 +142,8 @@ def find_unfixed_motions(
     if located is None:
         return None
     rows = FrameRows(problem, None if problem.nuisance is None else start.nuisance)
-    rows.add_rows(problem.rows, located[0][None], located[1], [None] * len(problem.rows))
+    divided = problem.rows if problem.is_uncertain else [r.divided() for r in problem.rows]
+    rows.add_rows(divided, located[0][None], located[1], [None] * len(divided))
     return rows.find_unfixed()
 
 

@@ -429,7 +429,7 @@ class Observations:
         for part in parts:
             inner = np.where(self.present[alike, :, None], drop_repeats(part.covariance), 0.0)
             share, axes = np.linalg.eigh(W @ inner @ np.swapaxes(W, 1, 2) / weight)
-            root = np.sqrt(np.maximum(share, 0.0))[:, :, None] * np.swapaxes(axes, 1, 2)
+            root = axes * np.sqrt(np.maximum(share, 0.0))[:, None] @ np.swapaxes(axes, 1, 2)
             split.append((part.name, part.size, np.broadcast_to(root, self.whitener.shape)))
         return split
 

@@ -28,7 +28,8 @@ from loopcal.typing import BoolArray, FloatArray, IntArray
 
 # The elimination tree: in which order unknowns of different scopes are eliminated.
 
-SCOPES = ("machine", "session", "group", "pose")
+TARGET = "target"
+SCOPES = ("machine", "session", "group", "pose", TARGET)
 """Scopes of unknowns, from the outermost to the innermost."""
 
 

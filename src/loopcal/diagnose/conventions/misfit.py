@@ -186,11 +186,10 @@ def exclude_far_rows(comparison: Comparison) -> Comparison:
     expected = [np.ones(rows.whitener.shape[1:3]) for rows in problem.rows]
     first, p = np.arange(1), problem.parameters
     if not problem.is_uncertain:
-        blocks = problem.take(first).leverage_rows(linearization.take(first))
-        for block, rows_of_block in zip(problem.poses.blocks, blocks, strict=True):
+        for rows_of_block in problem.take(first).leverage_rows(linearization.take(first)):
             for rows in rows_of_block:
                 A = rows.rows[..., -p - 1 : -1]
-                chosen = block.row_numbers[rows.kind][rows.numbers]
+                chosen = rows.numbers[:, None], rows.columns
                 expected[rows.kind][chosen] = np.sqrt(1.0 + (A**2).sum(axis=-1))
     ratios = []
     for r, sd in zip(comparison.residuals(), expected, strict=True):

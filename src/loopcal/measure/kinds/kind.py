@@ -414,6 +414,12 @@ class Kind(ABC):
         """The u parameters of all unknown items; rows of one scope share a value."""
         return tuple(p for item in self.setup_items.values() for p in item.parameters)
 
+    def divide(self) -> tuple[Kind, IntArray] | None:
+        """Return the kind of the rows of one target, and the places (k, u') of its nuisance
+        parameters for each of k targets; None where rows are not divided.
+        """
+        return None
+
     def without_shared_errors(self) -> Self:
         """Return the kind without common errors of the instrument."""
         return replace(cast(Any, self), unknown=tuple(self.own_items))

@@ -34,7 +34,7 @@ from loopcal.measure.kinds.kind import (
     checked,
     make_angles,
 )
-from loopcal.typing import BoolArray, FloatArray
+from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension
 
 # The g columns of each target (.., k, g), their derivatives (.., k, g, 3) by its coordinates in the
@@ -144,6 +144,18 @@ class TargetKind(Kind):
                 self.targets, places, "machine" if self.is_of_base else "session"
             ),
         }
+
+    def divide(self) -> tuple[Kind, IntArray] | None:
+        """Return the kind of one unknown target: its place is a parameter, so that one kind stands
+        for all.
+        """
+        if self.places is None or len(self.targets) == 1 or "targets" not in self.unknown:
+            return None
+        pairs = zip(self.targets, self.places, strict=True)
+        kinds = [replace(self, targets=(name,), places=place[None]) for name, place in pairs]
+        names = [p.name for p in self.nuisance_parameters]
+        places = [[names.index(p.name) for p in kind.nuisance_parameters] for kind in kinds]
+        return kinds[0], np.array(places)
 
     @abstractmethod
     def predict(self, x: FloatArray, values: FloatArray) -> Prediction:

@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Rows of sessions and targets keep the columns of their own setup, whatever else was measured."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from benchmarks.bench_growth import draw_sessions
+from loopcal.diagnose.blunders import Predictor
+from loopcal.diagnose.residual_patterns import collect_residual_rows
+from loopcal.estimate import pose_rows
+from loopcal.estimate.fit_linearization import collect_uncertainty, linearize_fit
+from loopcal.estimate.identification import identify
+from loopcal.estimate.observation_rows import ObservationRows
+from loopcal.geometry import exp_so3, make_pose
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.measure.kinds.distance import Distance, Separation
+from loopcal.measure.kinds.position import Bearing, Position
+from loopcal.measure.kinds.surfaces import Plane, Sphere
+
+NAMES, PLACES = ("a", "b", "c"), np.array([[0.1, 0.0, 0.02], [-0.05, 0.08, 0.02], [0.0, -0.1, 0.0]])
+STATION = make_pose(exp_so3(np.array([0.1, -0.2, 0.7])), np.array([-1.2, 0.4, 0.3]))
+SHARED = {"targets": NAMES, "places": PLACES, "T_base_frame": STATION}
+KINDS = [
+    Position(unknown=("targets", "frame"), **SHARED),
+    Position(unknown=("targets", "bias", "scale"), **SHARED),
+    Bearing(unknown=("frame", "targets"), **SHARED),
+    Distance(unknown=("targets", "offset"), **SHARED),
+    Separation(unknown=("targets",), **SHARED),
+    Plane(unknown=("surface", "targets"), **SHARED),
+    Sphere(unknown=("surface", "targets"), **SHARED),
+]
+
+
+@pytest.mark.parametrize("kind", KINDS, ids=lambda kind: f"{kind.name}-{'-'.join(kind.unknown)}")
+def test_rows_of_one_target_are_those_of_all(kind) -> None:
+    rng, links = np.random.default_rng(1), kind.poses_per_row
+    T = np.array([make_pose(exp_so3(w), 0.1 * w) for w in rng.normal(0.0, 0.3, (4 * links, 3))])
+    c, m, u = len(kind.columns), len(kind.noise_columns), len(kind.nuisance_parameters)
+    measured, values = rng.uniform(0.5, 1.0, (1, 4, c)), rng.normal(0.0, 0.01, (1, u))
+    values = kind.nominal_values + values
+    poses = np.arange(4 * links).reshape((4, links) if links > 1 else 4)
+    used = np.tile(np.arange(u), (4, 1))
+    white = rng.uniform(1.0, 2.0, (1, 4, m))[..., None] * np.eye(m)
+    whole = ObservationRows(kind, poses, measured, white, used)
+    parts = whole.divided()
+    assert len(parts.poses) == 12
+    at = kind.evaluate(T[None, poses], measured, values[:, None])
+    own = parts.kind.evaluate(T[None, parts.poses], parts.measured, values[:, parts.nuisance])
+    assert_allclose(own.residual.reshape(1, 4, m), at.residual, atol=1e-14)
+    wide = np.zeros((1, 12, m // 3, u))
+    places = np.broadcast_to(parts.nuisance[:, None], own.nuisance.shape)
+    np.put_along_axis(wide, places, own.nuisance, axis=3)
+    assert_allclose(wide.reshape(1, 4, m, u), at.nuisance, atol=1e-14)
+    assert_allclose(
+        np.einsum("trii->tri", parts.whitener).reshape(1, 4, m), np.einsum("trii->tri", white)
+    )
+    mixed = white + 0.1  # errors that targets share
+    assert (shared := ObservationRows(kind, poses, measured, mixed, used)).divided() is shared
+
+
+def test_rows_do_not_grow_with_other_sessions_and_targets() -> None:
+    """Columns of all setup parameters would take 5 times the memory for 8 times the sessions."""
+    robot, sizes = load_robot("hexapod-42"), {}
+    for sessions, targets in ((3, 3), (24, 3), (3, 12)):
+        data = draw_sessions(robot, 240, sessions, targets)
+        fit = identify(robot, data)
+        linear = linearize_fit(fit, data)
+        blocks = linear.problem.leverage_rows(linear.linearization, linear.solution)
+        rows = collect_residual_rows(linear)
+        assert rows is not None
+        kept, values = fit.nuisance.names, fit.nuisance.values
+        predictor = Predictor(fit.robot, values, kept, collect_uncertainty(fit), ())
+        sizes[sessions, targets] = (
+            sum(part.rows.nbytes for parts in blocks for part in parts),
+            rows.basis.wide.nbytes + getattr(rows.basis.narrow, "nnz", 0) * 12,
+            sum(group.rows.nbytes for group in predictor.make_blocks(data).groups),
+        )
+    few, more_sessions, more_targets = (np.array(s, float) for s in sizes.values())
+    assert (more_sessions <= 1.02 * few).all()
+    assert (more_targets[:2] <= 1.3 * 4 * few[:2]).all()
+
+
+def test_residuals_of_many_blocks_of_poses_keep_their_rows(monkeypatch) -> None:
+    robot = load_robot("hexapod-42")
+    data = draw_sessions(robot, 60, 2, 2)
+    fit = identify(robot, data)
+    whole = collect_residual_rows(linearize_fit(fit, data))
+    monkeypatch.setattr(pose_rows, "EXACT_BLOCK", 7)
+    parts = collect_residual_rows(linearize_fit(fit, data))
+    assert whole is not None
+    assert parts is not None
+    for name in ("kind", "row", "column", "series"):
+        assert np.array_equal(getattr(whole, name), getattr(parts, name))
+    assert_allclose(parts.residual, whole.residual, atol=1e-9)
