@@ -793,9 +793,15 @@ def save_measurements(
 
 
 def format_measurements(
-    data: Measurements, robot: Mechanism, remark: str = "", states_use: bool = False
+    data: Measurements,
+    robot: Mechanism,
+    remark: str = "",
+    states_use: bool = False,
+    is_by_pose: bool = False,
 ) -> str:
-    """Return the text of a measurement file; `states_use` also where no pose is held out."""
+    """Return the text of a measurement file; `states_use` also where no pose is held out, and
+    `is_by_pose` for rows of all kinds in the order of their poses.
+    """
     from loopcal.measure.data_checks import check_kinds
 
     _refuse_names(data)
@@ -846,6 +852,8 @@ def format_measurements(
             body.append((poses, cells))
     measured = {poses[0] for poses, _ in body if len(poses) == 1}
     body = [([pose], {}) for pose in range(data.n_poses) if pose not in measured] + body
+    if is_by_pose:
+        body.sort(key=lambda row: row[0])
     for poses, cells in body:
         pose = LINK.join(data.labels[pose] for pose in poses)
         cells |= {"pose": pose}
@@ -891,7 +899,8 @@ def format_data_sheet(
     labels: Sequence[str] = (),
     is_held_out: ArrayLike | None = None,
 ) -> str:
-    """Return a measurement file with poses, readings (n, a) [SI] and empty measured values.
+    """Return a measurement file with poses, readings (n, a) [SI], NaN for those to be measured, and
+    empty measured values.
 
     `instrument` states the poses, session and group of each kind. Without `is_held_out` (n,), the
     file has no column `use`. DataError : a pose that does not exist, or a wrong number of names.
@@ -912,11 +921,14 @@ def format_data_sheet(
                 sensor.kind, sensor.rows, empty, sigma, sensor.session, sensor.group
             )
         )
+    readings = np.asarray(readings)
+    is_empty = np.isnan(readings)
     data = Measurements(
         robot.name,
-        np.asarray(readings),
+        readings,
         tuple(of_sensor for of_sensor in rows if not of_sensor.kind.is_of_base),
         labels=tuple(labels),
+        reading_sigma=np.where(is_empty, np.inf, 0.0) if is_empty.any() else None,
         stated_values=instrument.stated_values,
         is_held_out=np.array([] if is_held_out is None else is_held_out, dtype=bool),
         base_observations=tuple(of_sensor for of_sensor in rows if of_sensor.kind.is_of_base),

@@ -14,8 +14,7 @@ measured.
 
 from __future__ import annotations
 
-import csv
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -97,15 +96,17 @@ def format_plan_data(plan: Plan) -> str:
         for s in plan.instrument.sensors
     )
     factors = _list_columns(plan.robot)[1][-len(plan.robot.actuators) :]
-    readings = [
-        [parse_exact(_format(q, f), f) for q, f in zip(row, factors, strict=True)]
-        for row in plan.poses.readings.tolist()
-    ]
+    readings = np.array(
+        [
+            [parse_exact(_format(q, f), f) for q, f in zip(row, factors, strict=True)]
+            for row in plan.poses.readings.tolist()
+        ]
+    )
+    if any(isinstance(s.kind, Closure) for s in plan.instrument.sensors):
+        readings[:] = np.nan  # they are what is measured
     instrument = replace(plan.instrument, sensors=sensors)
     labels = plan.poses.labels
-    text = format_data_sheet(plan.robot, instrument, readings, labels, plan.poses.held_out)
-    is_closure = any(isinstance(s.kind, Closure) for s in plan.instrument.sensors)
-    return _empty_readings(text, plan.robot) if is_closure else text
+    return format_data_sheet(plan.robot, instrument, readings, labels, plan.poses.held_out)
 
 
 def find_plan_sheet(data: Path) -> Path:
@@ -197,21 +198,8 @@ def format_surface_data(plan: SurfacePlan) -> str:
         observations.append(
             Observations.from_sigma(sensor.kind, sensor.rows, gaps, sigma, "", sensor.group)
         )
-    poses = plan.poses
-    data = Measurements(robot.name, poses.readings, tuple(observations), labels=poses.labels)
-    order = {label: i for i, label in enumerate(poses.labels)}
-    return _empty_readings(format_measurements(data, robot), robot, lambda row: order[row[0]])
-
-
-def _empty_readings(
-    text: str, robot: Mechanism, order: Callable[[Sequence[str]], int] | None = None
-) -> str:
-    """Return a measurement file with empty cells of readings, its rows sorted by `order`."""
-    lines = text.splitlines()
-    first = next(i for i, line in enumerate(lines) if not line.startswith("#"))
-    names = _list_columns(robot)[0][-len(robot.actuators) :]
-    header, *rows = csv.reader(lines[first:])
-    is_reading = [name in names for name in header]
-    rows = rows if order is None else sorted(rows, key=order)
-    empty = [["" if is_reading[i] else cell for i, cell in enumerate(row)] for row in rows]
-    return "\n".join([*lines[:first], *map(format_row, [header, *empty])]) + "\n"
+    labels, empty = plan.poses.labels, np.full_like(plan.poses.readings, np.nan)
+    data = Measurements(
+        robot.name, empty, tuple(observations), labels=labels, reading_sigma=np.array(np.inf)
+    )
+    return format_measurements(data, robot, is_by_pose=True)
