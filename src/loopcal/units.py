@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Annotated, Any
 
@@ -30,6 +30,7 @@ class Dimension(Enum):
     TIME = "time"
     FORCE = "force"
     MOMENT = "moment"
+    RATIO_PER_TEMPERATURE = "ratio per temperature"
     LENGTH_PER_TEMPERATURE = "length per temperature"
     LENGTH_PER_TIME = "length per time"
     LENGTH_PER_FORCE = "length per force"
@@ -46,6 +47,8 @@ LARGEST = 1e9
 """Largest number of a file [m, rad, 1]: beyond it, squares and cubes lose all meaning."""
 SMALLEST_SD = 1e-15
 """Smallest standard deviation above zero [m, rad, 1]: the size of an atom's nucleus."""
+ABSOLUTE_ZERO, ROUNDING = -273.15, 1e-9
+"""Lowest temperature, and the rounding of a conversion that is accepted below it [degC]."""
 SD_RANGE = f"from {SMALLEST_SD:g} to {LARGEST:g} m, rad or 1"
 """The allowed standard deviations, for messages."""
 
@@ -53,6 +56,8 @@ Length = Annotated[float, Dimension.LENGTH]
 Angle = Annotated[float, Dimension.ANGLE]
 Ratio = Annotated[float, Dimension.RATIO]
 Pixel = Annotated[float, Dimension.PIXEL]
+Temperature = Annotated[float, Dimension.TEMPERATURE]
+Expansion = Annotated[float, Dimension.RATIO_PER_TEMPERATURE]
 
 
 @dataclass(frozen=True)
@@ -68,11 +73,14 @@ Reading = Annotated[float, DimensionOf("READING")]
 
 @dataclass(frozen=True)
 class Unit:
-    """A unit, with its symbol in files, e.g. "mm": `SI value = value * factor_to_si`."""
+    """A unit, with its symbol in files, e.g. "mm": `SI value = value * factor_to_si + offset`. Only
+    temperatures have an offset, which differences lack.
+    """
 
     symbol: str
     dimension: Dimension
     factor_to_si: float
+    offset: float = 0.0
 
     def __str__(self) -> str:
         return self.symbol
@@ -97,7 +105,12 @@ UNITS: dict[str, Unit] = {
         Unit("um/m", Dimension.RATIO, 1e-6),
         Unit("px", Dimension.PIXEL, 1.0),
         Unit("degC", Dimension.TEMPERATURE, 1.0),
+        Unit("K", Dimension.TEMPERATURE, 1.0, -273.15),
+        Unit("degF", Dimension.TEMPERATURE, 5 / 9, -160 / 9),
         Unit("s", Dimension.TIME, 1.0),
+        Unit("ms", Dimension.TIME, 1e-3),
+        Unit("min", Dimension.TIME, 60.0),
+        Unit("h", Dimension.TIME, 3600.0),
         Unit("N", Dimension.FORCE, 1.0),
         Unit("kN", Dimension.FORCE, 1e3),
         Unit("lbf", Dimension.FORCE, 4.4482216152605),
@@ -125,6 +138,15 @@ UNITS |= {
     for of in all_of
     for prefix in ("", "m", "u")
 }
+UNITS |= {
+    f"{of}/{by}": Unit(
+        f"{of}/{by}",
+        Dimension.RATIO_PER_TEMPERATURE,
+        UNITS[of].factor_to_si / UNITS[by].factor_to_si,
+    )
+    for of in ("1", "ppm", "um/m")
+    for by in ("degC", "K", "degF")
+}
 SI_SYMBOLS: dict[Dimension, str] = {
     Dimension.LENGTH: "m",
     Dimension.ANGLE: "rad",
@@ -135,6 +157,7 @@ SI_SYMBOLS: dict[Dimension, str] = {
     Dimension.TIME: "s",
     Dimension.FORCE: "N",
     Dimension.MOMENT: "Nm",
+    Dimension.RATIO_PER_TEMPERATURE: "1/degC",
 }
 SI_SYMBOLS |= {UNITS[f"{of}/{by}"].dimension: f"{of}/{by}" for by in SLOPES for of in SLOPES[by]}
 
@@ -148,6 +171,7 @@ DISPLAY_UNITS: dict[Dimension, Unit] = {
     Dimension.TIME: UNITS["s"],
     Dimension.FORCE: UNITS["N"],
     Dimension.MOMENT: UNITS["Nm"],
+    Dimension.RATIO_PER_TEMPERATURE: UNITS["ppm/K"],
 }
 DISPLAY_UNITS |= {
     unit.dimension: unit for unit in UNITS.values() if re.match("u(m|rad)/[^m]", unit.symbol)
@@ -163,6 +187,7 @@ EXAMPLES: Mapping[Dimension, str] = {
     Dimension.TIME: "60s",
     Dimension.FORCE: "500N",
     Dimension.MOMENT: "20Nm",
+    Dimension.RATIO_PER_TEMPERATURE: "11.5ppm/K",
 }
 
 
@@ -214,8 +239,11 @@ def parse_number(text: str) -> float | None:
     return float(text) if NUMBER.fullmatch(text.strip()) else None
 
 
-def parse_quantity(text: str, dimension: Dimension | None = None) -> float:
-    """Return the SI value of a number with its unit, such as `0.02mm` or `5 urad`.
+def parse_quantity(
+    text: str, dimension: Dimension | None = None, is_difference: bool = False
+) -> float:
+    """Return the SI value of a number with its unit, such as `0.02mm` or `5 urad`, also as the
+    difference of two values.
 
     UnitError : not a finite number, unit missing, unknown, or of another dimension.
     """
@@ -233,13 +261,14 @@ def parse_quantity(text: str, dimension: Dimension | None = None) -> float:
             f"{text!r} has no unit. Add one of {', '.join(list_symbols(dimension))}, for example "
             f"{example}"
         )
-    return to_si(value, find_unit(symbol, dimension))
+    unit = find_unit(symbol, dimension)
+    return to_si(value, replace(unit, offset=0.0) if is_difference else unit)
 
 
 def to_si(value: float, unit: Unit) -> float:
     """Return a finite number in SI.
 
-    UnitError : the number is larger than LARGEST.
+    UnitError : the number is larger than LARGEST, or a temperature below absolute zero.
     """
     if not abs(value) <= LARGEST / unit.factor_to_si:
         shown = (
@@ -249,7 +278,10 @@ def to_si(value: float, unit: Unit) -> float:
             f"{shown} {unit} exceeds {LARGEST:g} {SI_SYMBOLS[unit.dimension]}. Write a number "
             "that a machine can have"
         )
-    return value * unit.factor_to_si
+    si = value * unit.factor_to_si + unit.offset
+    if unit.offset and si < ABSOLUTE_ZERO - ROUNDING:
+        raise UnitError(f"{value:g} {unit} is below absolute zero. Correct it")
+    return si
 
 
 def is_sd(value: Any) -> Any:

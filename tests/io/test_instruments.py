@@ -94,7 +94,10 @@ pose,kind,left [deg],right [deg],x [mm],y [mm],distance [mm]
             "{serial_number: 0750123}",
             r"data.csv:3: .*'instrument.serial_number' is the number 750123",
         ),
-        ("{due: 31.5.2026}", r"data.csv:3: due is '31.5.2026'. Write a date as 2026-05-31"),
+        (
+            "{due: 31.5.2026}",
+            r"data.csv:3: 'instrument.due' is '31.5.2026'. Write a date as 2026-05-31",
+        ),
         ("{due: '2026-13-01'}", "Write a date as 2026-05-31"),
         ("{calibrated: 2026-02-01, due: 2026-01-01}", "which is before calibrated"),
         ("[AT960]", "Write its name, or"),

@@ -218,7 +218,7 @@ REFUSED = {
         (",7,", ",,", 6, "column 'sigma.q6' is empty, and this reading has no other noise"),
     ],
     CONTEXT: [
-        ("[degC]", "[mm]", 4, "'temperature' has the unit 'mm'. Write one of .degC., .K., .degF."),
+        ("[degC]", "[mm]", 4, "'temperature': 'mm' is a unit of length, .* Allowed: degC, K, degF"),
         (" [degC]", "", 4, "column 'temperature' has no unit"),
         (
             "2026-05-04T10:22:31.5",

@@ -286,15 +286,15 @@ def test_a_prior_without_a_session_holds_in_every_session_in_python(tmp_path):
 @pytest.mark.parametrize(
     ("line", "words"),
     [
-        ("scale: 2 ppm", "Write 'scale: {sd: 2 ppm}'"),
-        ("scale: {}", "Write 'scale: {sd: 2 ppm}'"),
+        ("scale: 2 ppm", "but must be a mapping. write 'key: value' lines with sd, limit, U"),
+        ("scale: {}", "an uncertainty has one form: 'sd'"),
         ("scale: {mean: 2 ppm}", "an uncertainty has one form"),
-        ("scale: {sd: 2}", "Write a number and one of 1, ppm, um/m"),
-        ("scale: {sd: 2 mm}", "Write a number and one of 1, ppm, um/m"),
-        ("scale: {sd: nan ppm}", "Write a number and one of"),
+        ("scale: {sd: 2}", "'2' has no unit. Add one of 1, ppm, um/m"),
+        ("scale: {sd: 2 mm}", "a ratio is needed. Allowed: 1, ppm, um/m"),
+        ("scale: {sd: nan ppm}", "Write a finite number with a unit"),
         ("scale: {sd: -2 ppm}", "'sd' of 'scale' is -2 ppm; write a positive number"),
         ("scale: {sd: 2 ppm, sigma: 3 ppm}", "sigma"),
-        ("scale: {sd: 2 ppm, scope: robot}", "the scope is 'robot'. Write session, or all"),
+        ("scale: {sd: 2 ppm, scope: robot}", "'scale.scope' is 'robot'. Allowed: 'session', 'all'"),
         ("temperature: {value: 23 mm, sd: 1 K, expansion: 11.5 ppm/K}", "degC, K, degF"),
         ("temperature: {value: 23 degC, sd: 1 mm, expansion: 11.5 ppm/K}", "degC, K, degF"),
         ("temperature: {value: 23 degC, sd: 1 K, expansion: 11.5 ppm}", "ppm/K"),
@@ -302,7 +302,7 @@ def test_a_prior_without_a_session_holds_in_every_session_in_python(tmp_path):
         ("temperature: {value: -5 K, sd: 1 K, expansion: 11.5 ppm/K}", "below absolute zero"),
         ("mpe: {per_length: 6 um/m}", "has no key 'constant'"),
         ("mpe: {constant: -6 um}", "positive number"),
-        ("mpe: {constant: 6 ppm}", "Write a number and one of m, mm"),
+        ("mpe: {constant: 6 ppm}", "a length is needed. Allowed: m, mm"),
     ],
 )
 def test_wrong_scales_are_refused_at_their_place(tmp_path, line, words):
@@ -310,6 +310,15 @@ def test_wrong_scales_are_refused_at_their_place(tmp_path, line, words):
     with pytest.raises(FileError, match=words) as caught:
         load_measurements(save_with(tmp_path / "a.csv", data, line), DELTA)
     assert "a.csv:1" in str(caught.value)
+
+
+def test_scale_that_is_known_exactly_has_no_uncertainty(tmp_path):
+    _, data = measure_biased()
+    loaded = load_measurements(
+        save_with(tmp_path / "a.csv", data, "scale: {mean: 2 ppm, sd: 0 ppm}"), DELTA
+    )
+    scales = {value for value in loaded.stated_values if value.name.endswith("scale")}
+    assert {(value.nominal, value.sd) for value in scales} == {(2e-6, 0.0)}
 
 
 def test_contradictions_of_scales_are_refused(tmp_path):

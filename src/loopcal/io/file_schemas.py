@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from typing import Annotated, Any, Literal, Union, cast, get_args, get_origin
 
 from loopcal.io.core.records import get_field_types
-from loopcal.io.data.kind_settings import SETTINGS, make_settings_record
+from loopcal.io.data.kind_settings import SCALED, SETTINGS, make_settings_record
 from loopcal.io.exports.profile import ProfileRecord
 from loopcal.io.robot.robot_file import (
     FORMAT,
@@ -156,7 +156,10 @@ def build_settings_schema() -> Schema:
     from loopcal.measure.kinds import KINDS
 
     make = SchemaMaker(units=False)
-    common: dict[str, Schema] = {key: {"description": text} for key, text in SETTINGS.items()}
+    common: dict[str, Schema] = {
+        key: {"description": text, **(make.refer(SCALED[key]) if key in SCALED else {})}
+        for key, text in SETTINGS.items()
+    }
     known = dict(common)
     choices = []
     for name, kind in KINDS.items():

@@ -121,10 +121,7 @@ def read_board(path: str | Path) -> Board:
     file = read_yaml(path, "board file")
     check_format(file, FORMAT)
     content = {key: value for key, value in file.content.items() if key != "format"}
-    try:
-        return read_record(file, content, Board, None)
-    except DataError as error:
-        raise file.error(str(error)) from None
+    return read_record(file, content, Board, None)
 
 
 def format_board(board: Board) -> str:

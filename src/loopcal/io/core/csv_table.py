@@ -42,7 +42,7 @@ from loopcal.io.core.text_file import as_path, read_text
 from loopcal.io.core.yaml_file import YamlFile, parse_yaml, read_yaml
 from loopcal.plain_text import quote
 from loopcal.typing import FloatArray, IntArray
-from loopcal.units import LARGEST, Dimension, find_unit, parse_number
+from loopcal.units import DISPLAY_UNITS, LARGEST, Dimension, Unit, find_unit, parse_number
 
 
 def parse_decimals(cells: Sequence[str], factor: float) -> FloatArray:
@@ -215,7 +215,7 @@ class Table:
         FileError : no unit or one of another dimension, a cell that is not a finite number (or
         `inf`, where `infinite` cells are allowed), or is empty where it must not be.
         """
-        factor = self.factor(name, dimension)
+        factor = self.unit(name, dimension).factor_to_si
         values = self.scaled_numbers(name, factor, empty, infinite)
         beyond = np.flatnonzero((np.abs(values) > LARGEST) & np.isfinite(values))
         if len(beyond):
@@ -241,15 +241,15 @@ class Table:
             first += len(cells)
         return np.concatenate(parts)
 
-    def factor(self, name: str, dimension: Dimension, symbol: str | None = None) -> float:
-        """Return SI per unit of a column, or of `symbol`, a factor of its unit; see `numbers`."""
+    def unit(self, name: str, dimension: Dimension, symbol: str | None = None) -> Unit:
+        """Return the unit of a column, or that of `symbol`, a factor of its unit; see `numbers`."""
         symbol = self.units[name] if symbol is None else symbol
         if symbol is None:
-            example = f"{name} [{'mm' if dimension is Dimension.LENGTH else 'deg'}]"
+            example = f"{name} [{DISPLAY_UNITS[dimension]}]"
             sentence = f"column {name!r} has no unit. Write it in brackets, such as {example!r}"
             raise self.header_error(sentence)
         try:
-            return find_unit(symbol, dimension).factor_to_si
+            return find_unit(symbol, dimension)
         except UnitError as error:
             raise self.header_error(f"column {name!r}: {error}") from None
 

@@ -22,7 +22,7 @@ from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
-from loopcal.errors import FileError, UnitError, suggest_names
+from loopcal.errors import DataError, FileError, UnitError, suggest_names
 from loopcal.io.core.yaml_file import Location, YamlFile, name_location, refuse_unknown_keys
 from loopcal.plain_text import quote
 from loopcal.units import Dimension, DimensionOf, Unit, find_unit, list_symbols, to_si
@@ -134,7 +134,8 @@ class _RecordReader:
         if origin in (tuple, list):
             return origin(self._read_items(arguments, node, at, of))
         if _is_record(annotation):
-            return self._read_fields(annotation, _require(dict, node, at), at)
+            keys = f" with {', '.join(get_field_types(annotation))}"
+            return self._read_fields(annotation, _require(dict, node, at, keys), at)
         if _is_mapping(annotation):
             items = _require(dict, node, at).items()
             return {key: self.read(arguments[1], value, (*at, key), of) for key, value in items}
@@ -194,7 +195,7 @@ class _RecordReader:
                 raise _MisfitError(f"{_name(at)} has no key {key!r}", ". Add it", at)
         try:
             return record(**values)
-        except ValueError as error:  # what the record itself says of its values
+        except (ValueError, DataError) as error:  # what the record itself says of its values
             key, _, fact = str(error).partition(" ")
             if key in node:  # its text begins with the key that is wrong
                 raise _MisfitError(f"{_name((*at, key))} {fact}", "", (*at, key)) from None
@@ -286,8 +287,10 @@ NEEDED: Mapping[type, tuple[tuple[type, ...], str, str]] = {
 """Type of a field -> types that a file may have there, in words, and what to do."""
 
 
-def _require(needed: Any, node: Any, at: Location) -> Any:
-    """Return a node of the type that is needed; a whole number as a float where that is needed."""
+def _require(needed: Any, node: Any, at: Location, details: str = "") -> Any:
+    """Return a node of the type that is needed; a whole number as a float where that is needed.
+    `details` end what to do.
+    """
     allowed, words, act = NEEDED[needed]
     if isinstance(node, allowed) and (needed is bool or not isinstance(node, bool)):
         return float(node) if needed is float else node
@@ -296,7 +299,8 @@ def _require(needed: Any, node: Any, at: Location) -> Any:
     if needed in (float, int) and isinstance(node, str) and node.strip()[:1] in "+-.0123456789":
         act = "Write the number without quotes or unit"
         act = "Write a decimal point, not a comma" if "," in node else act
-    raise _MisfitError(f"{_name(at)} is {_describe(node)}, but must be {words}", f". {act}", at)
+    fact = f"{_name(at)} is {_describe(node)}, but must be {words}"
+    raise _MisfitError(fact, f". {act}{details}", at)
 
 
 def _name(location: Location) -> str:

@@ -64,10 +64,12 @@ class YamlFile:
         exists = location[:1] in self.lines
         return FileError(sentence, self.path, self.line(location) if exists else None)
 
-    def quantity(self, node: Any, dimension: Dimension, location: Location) -> float:
+    def quantity(
+        self, node: Any, dimension: Dimension, location: Location, is_difference: bool = False
+    ) -> float:
         """Return the SI value of a number with its unit, such as `5 um`; else FileError."""
         try:
-            return parse_quantity(str(node), dimension)
+            return parse_quantity(str(node), dimension, is_difference)
         except UnitError as error:
             raise self.error(f"{name_location(location)!r}: {error}", location) from None
 
@@ -248,7 +250,8 @@ class _NodeReader:
         content: dict[str, Any] = {}
         merged: list[dict[str, Any]] = []
         for name, node in nodes:
-            line = name.start_mark.line
+            # an alias has no place of its own, but its value has
+            line = (node if id(name) in self.sizes else name).start_mark.line
             if not isinstance(name.value, str):
                 raise _RefusedError("a key is a list or a mapping. Write text there", line)
             if name.tag.endswith(":merge"):

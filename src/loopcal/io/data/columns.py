@@ -11,7 +11,7 @@ import math
 import re
 import unicodedata
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from itertools import permutations
@@ -32,7 +32,7 @@ from loopcal.mechanism.assembly import FORCES
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import get_dimension
 from loopcal.typing import FloatArray, IntArray
-from loopcal.units import DISPLAY_UNITS, Dimension, find_unit
+from loopcal.units import ABSOLUTE_ZERO, DISPLAY_UNITS, ROUNDING, SI_SYMBOLS, Dimension, find_unit
 
 if TYPE_CHECKING:
     from loopcal.measure.kinds.kind import Kind
@@ -44,14 +44,6 @@ COMMANDED, MEASURED, SIGMA, COVARIANCE = "commanded.", "measured.", "sigma.", "c
 TIME, TEMPERATURE, NOTE = "time", "temperature", "note"
 FIT, HELD_OUT = "fit", "held-out"
 """Cells of the column `use`."""
-
-Scales = Mapping[str, tuple[float, float]]
-TIME_UNITS: Scales = {"s": (1.0, 0.0), "ms": (1e-3, 0.0), "min": (60.0, 0.0), "h": (3600.0, 0.0)}
-TEMPERATURE_UNITS: Scales = {"degC": (1.0, 0.0), "K": (1.0, -273.15), "degF": (5 / 9, -160 / 9)}
-"""Unit -> factor and offset to seconds, or degrees Celsius."""
-
-ABSOLUTE_ZERO, ROUNDING = -273.15, 1e-9
-"""Lowest temperature, and the rounding of a conversion that is accepted below it [degC]."""
 
 
 @dataclass(frozen=True)
@@ -162,7 +154,7 @@ class ProductColumn(Column):
             sentence = f"column {self.name!r} needs two units, as in '{self.name} [mm*mrad]'"
             raise table.header_error(sentence)
         a, b = (
-            table.factor(self.name, dimension, symbol.strip())
+            table.unit(self.name, dimension, symbol.strip()).factor_to_si
             for symbol, dimension in zip(symbols, self.dimensions, strict=True)
         )
         return table.scaled_numbers(self.name, 1.0, empty=False) * (a * b)
@@ -182,29 +174,25 @@ class ContextColumn(Column):
     """
 
     @property
-    def units(self) -> Scales:
-        """Unit -> factor and offset."""
-        return TIME_UNITS if self.name == TIME else TEMPERATURE_UNITS
+    def dimension(self) -> Dimension:
+        """Time, or temperature."""
+        return Dimension.TIME if self.name == TIME else Dimension.TEMPERATURE
 
     @property
     def header(self) -> str:
         """Name and unit."""
-        return f"{self.name} [{next(iter(self.units))}]"
+        return f"{self.name} [{SI_SYMBOLS[self.dimension]}]"
 
     def parse(self, table: Table) -> FloatArray:
         """Return the values [s] or [degC], NaN where a cell is empty."""
-        symbol, cells = table.units[self.name], table.text(self.name)
-        if self.name == TIME and symbol is None:
+        cells = table.text(self.name)
+        if self.name == TIME and table.units[self.name] is None:
             return np.array([self._parse_date(table, row, cell) for row, cell in enumerate(cells)])
-        if symbol is None or symbol not in self.units:
-            stated = "no unit" if symbol is None else f"the unit {symbol!r}"
-            allowed = ", ".join(f"[{s}]" for s in self.units)
-            raise table.header_error(f"column {self.name!r} has {stated}. Write one of {allowed}")
-        factor, offset = self.units[symbol]
-        values = table.scaled_numbers(self.name, factor) + offset
+        unit = table.unit(self.name, self.dimension)
+        values = table.scaled_numbers(self.name, unit.factor_to_si) + unit.offset
         lowest = -math.inf if self.name == TIME else ABSOLUTE_ZERO - ROUNDING
         for row in np.flatnonzero(values < lowest).tolist():
-            sentence = f"column {self.name!r} is {cells[row]} {symbol}, below absolute zero"
+            sentence = f"column {self.name!r} is {cells[row]} {unit}, below absolute zero"
             raise table.row_error(row, f"{sentence}. Correct it, or leave the cell empty")
         return values
 

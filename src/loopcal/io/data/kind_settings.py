@@ -26,17 +26,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, make_dataclass, replace
 from fnmatch import fnmatchcase
 from functools import cache, reduce
-from typing import (
-    TYPE_CHECKING,
-    Annotated,
-    Any,
-    Literal,
-    NamedTuple,
-    Union,
-    cast,
-    get_args,
-    get_origin,
-)
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Union, cast, get_args, get_origin
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,12 +39,8 @@ from loopcal.io.core.records import get_field_types, read_record
 from loopcal.io.core.text_file import name_files
 from loopcal.io.core.yaml_file import Location, YamlFile, refuse_unknown_keys
 from loopcal.io.data.columns import (
-    ABSOLUTE_ZERO,
-    ROUNDING,
     ROW_COLUMNS,
     SIGMA,
-    TEMPERATURE_UNITS,
-    Scales,
     find_column_fault,
     list_columns,
     name_covariance,
@@ -74,12 +60,13 @@ from loopcal.units import (
     UNITS,
     Angle,
     Dimension,
+    Expansion,
     Length,
     Pixel,
     Ratio,
+    Temperature,
     Unit,
     find_sd_fault,
-    list_symbols,
 )
 
 if TYPE_CHECKING:
@@ -112,6 +99,54 @@ FORMS: Mapping[str, tuple[str, float | None]] = {
 
 MOST_K = 10.0
 """Largest coverage factor."""
+
+
+@dataclass(frozen=True)
+class Uncertainty:
+    """An uncertainty: a standard deviation, a limit, or an expanded uncertainty.
+
+    Parameters
+    ----------
+    sd : standard deviation. limit : half of the width within which the value is uniform.
+    U : expanded uncertainty, `k` standard deviations.
+    """
+
+    sd: Any = None
+    limit: Any = None
+    U: Any = None
+    k: float | None = None
+
+    def __post_init__(self) -> None:
+        if len(self.forms) != 1:
+            sentence = "an uncertainty has one form: 'sd', 'limit' (uniform within it), or 'U'"
+            raise ValueError(f"{sentence} with its 'k'. Write one of them")
+        if self.k is not None and (self.forms != ["U"] or not 1.0 <= self.k <= MOST_K):
+            act = f"Write the coverage factor of 'U', from 1 to {MOST_K:g}"
+            raise ValueError(f"k is {self.k:g}. {act}")
+
+    @property
+    def forms(self) -> list[str]:
+        """The keys of FORMS that are stated."""
+        return [name for name in FORMS if getattr(self, name) is not None]
+
+    def read(
+        self,
+        file: YamlFile,
+        dimension: Dimension,
+        place: Location,
+        what: str,
+        may_be_zero: bool = False,
+    ) -> StatedSd:
+        """Return the standard deviation [SI] with its statement; FileError where it is none."""
+        (form,) = self.forms
+        distribution, divisor = FORMS[form]
+        divisor = divisor or self.k or 2.0
+        text = getattr(self, form)
+        sd = file.quantity(text, dimension, place, is_difference=True)
+        if (sd or not may_be_zero) and (fault := find_sd_fault(sd)):
+            raise file.error(f"{what} is {text}; {fault}", place)
+        return sd / divisor, _state_size(text, distribution, divisor)
+
 
 StatedSd = tuple[float, "StatedSize"]  # standard deviation [SI], and how it is stated
 
@@ -203,43 +238,12 @@ def match_names(
         yield node, matching, (*place, pattern)
 
 
-def _read_sd(
-    file: YamlFile, text: Any, dimension: Dimension, place: Location, what: str, act: str = ""
-) -> float:
-    """Return a standard deviation [SI]; FileError where it cannot be one."""
-    sd = file.quantity(text, dimension, place)
-    if fault := find_sd_fault(sd):
-        raise file.error(f"{what} is {text}; {fault}{act}", place)
-    return sd
-
-
 def _read_size(
     file: YamlFile, node: Any, dimension: Dimension, place: Location, what: str
 ) -> StatedSd:
-    """Return a standard deviation [SI] with its statement: a text `8 um`, a limit, or an expanded
-    uncertainty. FileError where it is none of these.
-    """
+    """Return a standard deviation [SI] with its statement: a text `8 um`, or an uncertainty."""
     stated = node if isinstance(node, dict) else {"sd": node}
-    refuse_unknown_keys(file, list(stated), [*FORMS, "k"], place)
-    form, distribution, divisor = _choose_form(file, stated, place)
-    sd = _read_sd(file, stated[form], dimension, place, what) / divisor
-    return sd, _state_size(stated[form], distribution, divisor)
-
-
-def _choose_form(
-    file: YamlFile, stated: Mapping[str, Any], place: Location
-) -> tuple[str, str, float]:
-    """Return the key that states an uncertainty, its distribution, and its divisor."""
-    forms = [name for name in FORMS if name in stated]
-    if len(forms) != 1:
-        sentence = "an uncertainty has one form: 'sd', 'limit' (uniform within it), or 'U'"
-        raise file.error(f"{sentence} with its 'k'. Write one of them", place)
-    form, k = forms[0], stated.get("k", 2.0)
-    if not (isinstance(k, int | float) and 1.0 <= k <= MOST_K) or ("k" in stated and form != "U"):
-        sentence = f"'k' is {k!r}. Write the coverage factor of 'U', from 1 to {MOST_K:g}"
-        raise file.error(sentence, (*place, "k") if "k" in stated else place)
-    distribution, divisor = FORMS[form]
-    return form, distribution, divisor or float(k)
+    return read_record(file, stated, Uncertainty, None, place).read(file, dimension, place, what)
 
 
 def _state_size(text: Any, distribution: str = "normal", divisor: float = 1.0) -> StatedSize:
@@ -542,19 +546,16 @@ def read_instrument(
     """Return the stated instrument, None where there is none; FileError for wrong content."""
     from loopcal.measure.observations import InstrumentRecord
 
-    stated, place = node.get("instrument"), (*location, "instrument")
-    if stated is None:
+    if (stated := node.get("instrument")) is None:
         return None
     if isinstance(stated, str):
         return InstrumentRecord(name=stated)
+    place = (*location, "instrument")
     if not isinstance(stated, dict) or not stated:
         sentence = "'instrument' is neither a name nor facts of an instrument. Write its name, or"
         example = 'instrument: {name: AT960, serial_number: "750123", certificate: D-K-15123}'
         raise file.error(f"{sentence} '{example}'", place)
-    try:
-        return read_record(file, stated, InstrumentRecord, None, place)
-    except DataError as error:
-        raise file.error(str(error), place) from None
+    return read_record(file, stated, InstrumentRecord, None, place)
 
 
 def describe_instrument(record: InstrumentRecord) -> str | dict[str, str]:
@@ -581,45 +582,40 @@ SHARED_ERRORS: Mapping[str, str] = {
 }
 
 
-class ScaleRule(NamedTuple):
-    """What a setting states that scales lengths."""
-
-    units: Mapping[str, Scales]  # key -> units of its number
-    required: tuple[str, ...]  # keys
-    example: str
+Scope = Literal["session", "all"]
 
 
-LENGTH_UNITS, RATIO_UNITS = (
-    {symbol: (UNITS[symbol].factor_to_si, 0.0) for symbol in list_symbols(dimension)}
-    for dimension in (Dimension.LENGTH, Dimension.RATIO)
-)
-DIFFERENCE_UNITS = {symbol: (factor, 0.0) for symbol, (factor, _) in TEMPERATURE_UNITS.items()}
-EXPANSION_UNITS = {
-    f"{ratio}/{degree}": (of_ratio / of_degree, 0.0)
-    for ratio, (of_ratio, _) in RATIO_UNITS.items()
-    for degree, (of_degree, _) in DIFFERENCE_UNITS.items()
-}
-SCALED: Mapping[str, ScaleRule] = {
-    "scale": ScaleRule({**dict.fromkeys(FORMS, RATIO_UNITS), "mean": RATIO_UNITS}, (), "sd: 2 ppm"),
-    "temperature": ScaleRule(
-        {
-            "value": TEMPERATURE_UNITS,
-            **dict.fromkeys(FORMS, DIFFERENCE_UNITS),
-            "expansion": EXPANSION_UNITS,
-            "expansion_sd": EXPANSION_UNITS,
-            "reference": TEMPERATURE_UNITS,
-        },
-        ("value", "expansion"),
-        "value: 23 degC, sd: 1 K, expansion: 11.5 ppm/K",
-    ),
-    MPE: ScaleRule(
-        {"constant": LENGTH_UNITS, "per_length": RATIO_UNITS},
-        ("constant",),
-        "constant: 15 um, per_length: 6 um/m",
-    ),
-}
-NOT_NEGATIVE = (*FORMS, "expansion_sd", "constant", "per_length")
-REFERENCE = 20.0  # [degC], of ISO 1
+@dataclass(frozen=True, kw_only=True)
+class Scale(Uncertainty):
+    """A factor on all measured lengths, whose deviation from 1 has this mean."""
+
+    mean: Ratio = 0.0
+    scope: Scope = "session"
+
+
+@dataclass(frozen=True, kw_only=True)
+class PartTemperature(Uncertainty):
+    """The temperature of the machine or part, and its expansion minus that of the scale."""
+
+    value: Temperature
+    expansion: Expansion
+    expansion_sd: Expansion = 0.0
+    reference: Temperature = 20.0  # [degC], of ISO 1
+    scope: Scope = "session"
+
+
+@dataclass(frozen=True, kw_only=True)
+class PermissibleError:
+    """The maximum permissible error of lengths."""
+
+    constant: Length
+    per_length: Ratio = 0.0
+    scope: Scope = "session"
+
+
+SCALED = {"scale": Scale, "temperature": PartTemperature, MPE: PermissibleError}
+"""Setting -> record of what scales lengths."""
+
 ITEMS: Mapping[str, str] = {"session_bias": "bias", "session_drift": "drift"}
 
 
@@ -669,8 +665,10 @@ def read_shared_errors(
                 parameter = name_shared_error(kind, item, name)
                 priors.pop(parameter, None)
                 if text != UNKNOWN:
-                    what, act = "the standard deviation", f", or {UNKNOWN}"
-                    sd = _read_sd(file, text, components[name], at, what, act)
+                    sd = file.quantity(text, components[name], at)
+                    if fault := find_sd_fault(sd):
+                        sentence = f"the standard deviation is {text}; {fault}, or {UNKNOWN}"
+                        raise file.error(sentence, at)
                     priors[parameter] = StatedValue(parameter, sd)
     return kind, noise, list(priors.values())
 
@@ -682,64 +680,37 @@ def _add_unknown(kind: Kind, items: tuple[str, ...]) -> Kind:
 
 def _read_scales(
     file: YamlFile, key: str, node: Any, place: Location
-) -> tuple[StatedSd | None, dict[str, tuple[float, float, StatedSize]], Literal["session", "all"]]:
+) -> tuple[StatedSd | None, dict[str, tuple[float, float, StatedSize]], Scope]:
     """Return what one of the settings `SCALED` states: the standard deviation [m] of each length,
     where it states one; setup item -> mean, standard deviation and its statement, of a factor minus
     1; and whether one value holds for a session or for all.
     """
-    rule = SCALED[key]
-    if not isinstance(node, dict) or not node:
-        raise file.error(f"{key!r} is {node!r}. Write '{key}: {{{rule.example}}}'", place)
-    has_forms = "sd" in rule.units
-    refuse_unknown_keys(file, list(node), [*rule.units, "scope", *["k"] * has_forms], place)
-    if missing := [name for name in rule.required if name not in node]:
-        sentence = f"{key!r} has no key {missing[0]!r}. Add it"
-        raise file.error(f"{sentence}, as in '{key}: {{{rule.example}}}'", place)
-    stated = {
-        name: _read_in_units(file, node[name], units, (*place, name))
-        for name, units in rule.units.items()
-        if name in node
-    }
-    scope = node.get("scope", "session")
-    if scope not in ("session", "all"):
-        sentence = f"the scope is {scope!r}. Write session, or all for one value in all sessions"
-        raise file.error(sentence, (*place, "scope"))
-    for name in (n for n in stated if n in NOT_NEGATIVE and stated[n] != 0.0):
-        if fault := find_sd_fault(stated[name]):
+    stated: Any = read_record(file, node, SCALED[key], None, place)
+
+    def state(name: str) -> tuple[float, StatedSize] | None:
+        """Return a size that is not zero, and its statement; those of an MPE are uniform."""
+        if not (size := getattr(stated, name)):
+            return None
+        if fault := find_sd_fault(size):
             raise file.error(f"{name!r} of {key!r} is {node[name]}; {fault}", (*place, name))
-    if key == MPE:  # its values are uniform within it
-        limits = {
-            name: (stated[name] / SQRT_3, _state_size(node[name], "uniform", SQRT_3))
-            for name in ("constant", "per_length")
-            if stated.get(name)
-        }
-        scaled = {"scale": (0.0, *limits["per_length"])} if "per_length" in limits else {}
-        return limits.get("constant"), scaled, scope
-    form, distribution, divisor = _choose_form(file, node, place)
-    sd, size = stated[form] / divisor, _state_size(node[form], distribution, divisor)
+        if key == MPE:
+            return size / SQRT_3, _state_size(node[name], "uniform", SQRT_3)
+        return size, _state_size(node[name])
+
+    if key == MPE:
+        scale = state("per_length")
+        return state("constant"), {"scale": (0.0, *scale)} if scale else {}, stated.scope
+    dimension = Dimension.RATIO if key == "scale" else Dimension.TEMPERATURE
+    (form,) = stated.forms
+    what = f"{form!r} of {key!r}"
+    sd, size = stated.read(file, dimension, (*place, form), what, may_be_zero=True)
     if key == "scale":
-        return None, {"scale": (stated.get("mean", 0.0), sd, size)}, scope
-    rise, slope = stated["value"] - stated.get("reference", REFERENCE), stated["expansion"]
+        return None, {"scale": (stated.mean, sd, size)}, stated.scope
+    rise, slope = stated.value - stated.reference, stated.expansion
     factors = {"temperature": (rise * slope, abs(slope) * sd, size)}
-    if of_slope := stated.get("expansion_sd", 0.0):
-        size = _state_size(node["expansion_sd"])
-        factors["expansion"] = (0.0, of_slope * float(np.hypot(rise, sd)), size)
-    return None, {item: of for item, of in factors.items() if any(of[:2])}, scope
-
-
-def _read_in_units(file: YamlFile, node: Any, units: Scales, place: Location) -> float:
-    """Return a number with one of these units, scaled."""
-    match = NUMBER.match(text := str(node).strip())
-    number = float(match[0]) if match else np.nan
-    symbol = text[match.end() :].strip() if match else ""
-    if not np.isfinite(number) or symbol not in units:
-        allowed = ", ".join(units)
-        sentence = f"{place[-1]!r} of {place[-2]!r} is {node!r}. Write a number and one of"
-        raise file.error(f"{sentence} {allowed}", place)
-    factor, offset = units[symbol]
-    if units is TEMPERATURE_UNITS and factor * number + offset < ABSOLUTE_ZERO - ROUNDING:
-        raise file.error(f"{place[-1]!r} is {node}, below absolute zero. Correct it", place)
-    return factor * number + offset
+    if of_slope := state("expansion_sd"):
+        factors["expansion"] = (0.0, of_slope[0] * float(np.hypot(rise, sd)), of_slope[1])
+    return None, {item: of for item, of in factors.items() if any(of[:2])}, stated.scope
 
 
 # The rows of each kind: measured values and their noise.

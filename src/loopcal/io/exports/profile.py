@@ -33,9 +33,8 @@ from loopcal.io.data.columns import (
     POSE_COLUMNS,
     ROW_COLUMNS,
     SIGMA,
-    TEMPERATURE_UNITS,
     TIME,
-    TIME_UNITS,
+    ContextColumn,
     is_context,
 )
 from loopcal.io.data.kind_settings import POSE_SETTINGS, SETTINGS, list_kind_settings, read_kind
@@ -444,12 +443,13 @@ def _check_source(
         raise file.error(f"{name!r} is a number and has one source. Name one column", place)
     if source.symbol is not None:
         unit_place = (*place, "unit")
-        wanted = dimensions.get(name.replace(MEASURED, ""), ())
+        of_context = (ContextColumn(name).dimension,) if is_context(name) else ()
+        wanted = of_context or dimensions.get(name.replace(MEASURED, ""), ())
         _check_unit(file, name, source.symbol, unit_place, wanted)
         header = " ".join(map(str, source.places))
         match = STATED.search(header)
         stated = source.symbol if match is None else ALIASES.get(match["unit"], match["unit"])
-        known = {*list_symbols(), *TIME_UNITS, *TEMPERATURE_UNITS} - {"1"}
+        known = {*list_symbols()} - {"1"}
         if stated != source.symbol and stated in known:
             sentence = f"the export's header is {header!r}, but the unit here is {source.symbol!r}"
             act = f"Write the unit {stated}, or name the column by its place"
@@ -494,12 +494,6 @@ def _check_unit(
     file: YamlFile, name: str, symbol: str, place: Location, wanted: tuple[Dimension, ...]
 ) -> None:
     """Raise FileError for a unit that the column cannot have; any unit where `wanted` is empty."""
-    if is_context(name):
-        known = TIME_UNITS if name == TIME else TEMPERATURE_UNITS
-        if symbol not in known:
-            sentence = f"{symbol!r} is not a unit of {name!r}. Allowed: {', '.join(known)}"
-            raise file.error(sentence, place)
-        return
     factors = [part.strip() for part in symbol.split("*")]
     needed = wanted or (None,)
     if len(factors) != len(needed):
