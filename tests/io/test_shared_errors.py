@@ -290,7 +290,7 @@ def test_a_prior_without_a_session_holds_in_every_session_in_python(tmp_path):
         ("scale: {}", "an uncertainty has one form: 'sd'"),
         ("scale: {mean: 2 ppm}", "an uncertainty has one form"),
         ("scale: {sd: 2}", "'2' has no unit. Add one of 1, ppm, um/m"),
-        ("scale: {sd: 2 mm}", "a ratio is needed. Allowed: 1, ppm, um/m"),
+        ("scale: {sd: 2 mm}", "not of a ratio. Allowed: 1, ppm, um/m"),
         ("scale: {sd: nan ppm}", "Write a finite number with a unit"),
         ("scale: {sd: -2 ppm}", "'sd' of 'scale' is -2 ppm; write a positive number"),
         ("scale: {sd: 2 ppm, sigma: 3 ppm}", "sigma"),
@@ -302,7 +302,7 @@ def test_a_prior_without_a_session_holds_in_every_session_in_python(tmp_path):
         ("temperature: {value: -5 K, sd: 1 K, expansion: 11.5 ppm/K}", "below absolute zero"),
         ("mpe: {per_length: 6 um/m}", "has no key 'constant'"),
         ("mpe: {constant: -6 um}", "positive number"),
-        ("mpe: {constant: 6 ppm}", "a length is needed. Allowed: m, mm"),
+        ("mpe: {constant: 6 ppm}", "not of a length. Allowed: m, mm"),
     ],
 )
 def test_wrong_scales_are_refused_at_their_place(tmp_path, line, words):
