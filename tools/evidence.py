@@ -178,7 +178,9 @@ def fill_tables(text: str, folder: Path) -> str:
         table = tables[match["table"]]
         if match["column"]:
             at = table["columns"].index(match["column"])
-            table = {**table, "rows": [r for r in table["rows"] if r[at] == match["value"]]}
+            spec = table.get("formats", {at: ""})[at]
+            rows = [r for r in table["rows"] if _render_cell(r[at], spec) == match["value"]]
+            table = {**table, "rows": rows}
         return render_table(table)
 
     return fill_blocks(text, BLOCK, write)
