@@ -109,6 +109,8 @@ class DriveRecord:
     (`interpolation`); its unknown values are table1, table2, .., or table for all.
     """
 
+    SECTION: ClassVar[str] = "drives"
+    WORD: ClassVar[str] = "actuator"
     READING: ClassVar[Dimension] = Dimension.LENGTH
     GIVEN: ClassVar[Dimension] = Dimension.LENGTH
 
@@ -262,6 +264,8 @@ class LoadFrame:
 class CouplingRecord(Sum):
     """What every coupling can state."""
 
+    SECTION: ClassVar[str] = "couplings"
+    WORD: ClassVar[str] = "coupling"
     GIVEN: ClassVar[Dimension] = Dimension.LENGTH
 
     offset: Given = 0.0
@@ -338,48 +342,6 @@ class DrivenJoint:
     is_passive: bool = False
 
 
-@dataclass(frozen=True, eq=False)
-class PlacedRow:
-    """A drive or coupling of a file. joints : of its sum, driven joint by the name in the file."""
-
-    SECTION: ClassVar[str]
-    WORD: ClassVar[str]
-
-    name: str
-    drive: Drive | Coupling
-    joints: Mapping[str, str]
-
-    @property
-    def dimension(self) -> Dimension:
-        """Dimension of what it gives: the joint, the sum, the length of a triangle."""
-        return self.drive.GIVEN
-
-    @property
-    def sense(self) -> float:
-        """What the joint value changes per unit of what the drive gives."""
-        return 1.0
-
-    @property
-    def unknown(self) -> Sequence[str]:
-        """Terms to identify, in the order of the parameters."""
-        return self.drive.unknown
-
-    @property
-    def weights(self) -> dict[str, float]:
-        """Weights of the driven joints in a sum, in m and rad, by name."""
-        return {self.joints[alias]: w for part in list_parts(self.drive) for alias, w in part.items}
-
-    def list_terms(self) -> dict[str, Term]:
-        """Return the terms by the names that a file gives them; here those of a sum."""
-        return {
-            f"{part.word}.{alias}": Term(
-                part.dimension, weight, part.tolerance, {f"{WEIGHT}{self.joints[alias]}": 1.0}
-            )
-            for part in list_parts(self.drive)
-            for alias, weight in part.items
-        }
-
-
 class SumPart(NamedTuple):
     """Weights of a sum: the word for them, that of a joint by the name in the file, whether these
     joints turn, and the dimension and tolerance of the weights.
@@ -405,64 +367,79 @@ def list_parts(stated: Drive | Coupling) -> tuple[SumPart, ...]:
 
 
 @dataclass(frozen=True, eq=False)
-class PlacedDrive(PlacedRow):
-    """A drive and the joint that it moves; of several joints, the first.
+class PlacedRow:
+    """A drive or coupling of a file, which gives a joint, the length of a triangle, or a sum.
 
+    joints : of its sum, driven joint by the name in the file. joint : the first one.
     own : the actuator of the family, which gives the joint from what the drive gives: offset + gain
-    * that; it states what the drive does not.
+    * that; it states what the drive does not. reference : of the condition of a coupling.
     """
 
-    SECTION: ClassVar[str] = "drives"
-    WORD: ClassVar[str] = "actuator"
-
-    drive: Drive
+    name: str
+    drive: Drive | Coupling
+    joints: Mapping[str, str]
     joint: DrivenJoint
     own: Actuator
+    reference: float = 0.0
 
     @property
     def sense(self) -> float:
-        """Gain of the family."""
+        """What the joint value changes per unit of what the drive gives."""
         return self.own.terms.get("gain", 1.0)
 
     @property
     def unknown(self) -> Sequence[str]:
-        """Terms to identify, those of a triangle and weights first."""
+        """Terms to identify, of a drive those of a triangle and weights first."""
+        if isinstance(self.drive, CouplingRecord):
+            return self.drive.unknown
         first = ("foot", "head", SKEW, "weight")
         return sorted(self.drive.unknown, key=lambda term: term.partition(".")[0] not in first)
 
     @property
+    def weights(self) -> dict[str, float]:
+        """Weights of the driven joints in a sum, in m and rad, by name."""
+        return {self.joints[alias]: w for part in list_parts(self.drive) for alias, w in part.items}
+
+    @property
     def stroke(self) -> tuple[float, float] | None:
         """Allowed readings, the family's if the drive states none and has readings like them."""
-        return self.drive.stroke or (self.own.stroke if self._is_like_own else None)
+        return getattr(self.drive, "stroke", None) or (
+            self.own.stroke if self._is_like_own else None
+        )
 
     @property
     def load(self) -> Actuator | None:
-        """The load as a reading, where a compliance is stated or unknown."""
-        is_elastic = self.drive.compliance or "compliance" in self.drive.unknown
+        """The load of a drive as a reading, where a compliance is stated or unknown."""
+        is_elastic = getattr(self.drive, "compliance", 0.0) or "compliance" in self.drive.unknown
         return Actuator(LOAD + self.name, self._load, reference=0.0) if is_elastic else None
 
     @property
     def _load(self) -> Dimension:
-        return Dimension.MOMENT if self.dimension is Dimension.ANGLE else Dimension.FORCE
+        return Dimension.MOMENT if self.drive.GIVEN is Dimension.ANGLE else Dimension.FORCE
 
     @property
     def _is_like_own(self) -> bool:
-        return self.own.dimension is self.drive.READING
+        return self.own.dimension is getattr(self.drive, "READING", None)
 
     @property
     def law(self) -> dict[str, float]:
         """Terms of the transmission but those of a triangle."""
-        terms = {"offset": self.own.terms.get("offset", 0.0)}
+        terms = {"offset": self.own.terms.get("offset", 0.0), "gain": 0.0}
         for of in self._list_own_terms().values():
             for term, change in of.maps.items():
-                if of.nominal or term == "gain":
+                if of.nominal:
                     terms[term] = terms.get(term, 0.0) + change * of.nominal
         return terms
 
     @property
     def actuator(self) -> Actuator:
-        """The actuator; raises MechanismError for an impossible triangle."""
+        """The actuator, of a coupling the row of joints, whose only reading is a condition; raises
+        MechanismError for an impossible triangle.
+        """
         drive, terms = self.drive, self.law
+        if isinstance(drive, CouplingRecord):
+            sums = {"weights": self.weights, "column": drive.condition}
+            return Actuator(self.name, drive.GIVEN, None, terms, **sums)
         if isinstance(drive, TriangleDrive):
             terms |= place_triangle(self.name, drive, self.joint.rotation, self.joint.start)
         return Actuator(
@@ -479,14 +456,26 @@ class PlacedDrive(PlacedRow):
 
     def list_terms(self) -> dict[str, Term]:
         """Return all terms by the names that a file gives them."""
-        terms = self._list_own_terms() | super().list_terms()
+        terms = self._list_own_terms()
+        for part in list_parts(self.drive):
+            for alias, weight in part.items:
+                maps = {f"{WEIGHT}{self.joints[alias]}": 1.0}
+                terms[f"{part.word}.{alias}"] = Term(part.dimension, weight, part.tolerance, maps)
         if isinstance(self.drive, TriangleDrive):
             terms |= list_triangle_terms(self.drive, self.joint.rotation)
         return terms
 
     def _list_own_terms(self) -> dict[str, Term]:
         """Return the terms that the joint value is a sum of."""
-        drive, own, length, sense = self.drive, self.dimension, Dimension.LENGTH, self.sense
+        drive, own, length, sense = self.drive, self.drive.GIVEN, Dimension.LENGTH, self.sense
+        tolerance, scale = getattr(drive, own.value), dict[str, Term]()
+        if isinstance(drive, CouplingRecord):
+            terms = {"offset": Term(own, drive.offset, tolerance, {"offset": 1.0})}
+            if drive.condition:
+                per = own.per(get_condition_dimension(drive.condition))
+                turns = {"gain": 1.0, "offset": -self.reference}  # about the reference
+                terms["slope"] = Term(per, drive.slope, drive.slopes, turns)
+            return terms
         if isinstance(drive, SpoolDrive):
             buildup = {"curve": sense * CURVE_OF_BUILDUP}
             scale = {
@@ -504,7 +493,6 @@ class PlacedDrive(PlacedRow):
         units = {"curve": 1 / reach**2 if 0.0 < reach < np.inf else np.nan}
         numbers = {t: getattr(drive, t) for t in ("offset", "curve", "backlash", *HARMONICS)}
         numbers |= {f"{TABLE}{k}": value for k, (_, value) in enumerate(drive.table, 1)}
-        tolerance = getattr(drive, own.value)
         terms = {
             name: Term(own, number, tolerance, {name: sense * units.get(name, 1.0)})
             for name, number in numbers.items()
@@ -513,36 +501,6 @@ class PlacedDrive(PlacedRow):
         given = {"compliance": sense * (1 / sense)}
         per_load = Term(own.per(self._load), drive.compliance, drive.compliances, given)
         return {"offset": terms["offset"]} | scale | terms | {"compliance": per_load}
-
-
-@dataclass(frozen=True, eq=False)
-class PlacedCoupling(PlacedRow):
-    """A coupling of joints by their drives. reference : of its condition."""
-
-    SECTION: ClassVar[str] = "couplings"
-    WORD: ClassVar[str] = "coupling"
-
-    drive: Coupling
-    reference: float = 0.0
-
-    @property
-    def actuator(self) -> Actuator:
-        """The row of joints, whose only reading is a condition."""
-        slope, column = self.drive.slope, self.drive.condition
-        terms = {"offset": self.drive.offset - slope * self.reference, "gain": slope}
-        weights = self.weights
-        return Actuator(self.name, self.dimension, None, terms, weights=weights, column=column)
-
-    def list_terms(self) -> dict[str, Term]:
-        """Return offset, slope, weights and radii by the names that a file gives them."""
-        coupling, own = self.drive, self.dimension
-        spread = getattr(coupling, own.value)
-        terms = {"offset": Term(own, coupling.offset, spread, {"offset": 1.0})}
-        if coupling.condition:
-            per = own.per(get_condition_dimension(coupling.condition))
-            turns = {"gain": 1.0, "offset": -self.reference}  # about the reference
-            terms["slope"] = Term(per, coupling.slope, coupling.slopes, turns)
-        return terms | super().list_terms()
 
 
 def row_errors(
@@ -560,8 +518,8 @@ def row_errors(
         chosen = [stated] if stated in terms else whole
         if not chosen:
             hint = f"{suggest_names(stated, list(terms))}. Allowed: {', '.join(terms)}"
-            sentence = f"{row.WORD} {name!r} has no term {stated!r}{hint}"
-            raise RecordError(sentence, row.SECTION, name)
+            sentence = f"{row.drive.WORD} {name!r} has no term {stated!r}{hint}"
+            raise RecordError(sentence, row.drive.SECTION, name)
         for term in chosen:
             dimension, nominal, tolerance, changes, positive = terms[term]
             parameter = f"{name}.{term}"
@@ -569,7 +527,7 @@ def row_errors(
                 raise RecordError(
                     f"{parameter} rotates the triangle about the joint's own axis, which changes "
                     "no length. Leave it out",
-                    row.SECTION,
+                    row.drive.SECTION,
                     name,
                 )
             sd = spread.select(dimension) if spread else standard_deviation(tolerance, parameter)
@@ -589,7 +547,7 @@ def complete_row(row: PlacedRow, spread: ErrorTolerances) -> ErrorModel:
     changes its lever most: see docs/theory/kinematics.md.
     """
     unknown = ["offset"]
-    if isinstance(row, PlacedDrive) and isinstance(row.drive, TriangleDrive):
+    if isinstance(row.drive, TriangleDrive):
         across = row.joint.rotation[:, :2]
         foot = sorted(np.argsort(-np.linalg.norm(across, axis=1), kind="stable")[:2].tolist())
         head = int(np.argmax(np.abs(across @ (across.T @ row.drive.triangle.head))))
@@ -619,38 +577,29 @@ def list_conditions(stated: Mapping[str, Condition]) -> Iterator[Actuator]:
         yield Actuator(name, dimension, condition.range, reference=condition.reference)
 
 
-class PlacedRows(NamedTuple):
-    """Drives in the order of the readings and couplings, by name, and the limbs with `limb.joint`
-    as the drive of each passive joint that they name.
-    """
-
-    limbs: tuple[PlacedLimb, ...]
-    drives: dict[str, PlacedDrive]
-    couplings: dict[str, PlacedCoupling]
-
-
 def place_rows(
     limbs: Sequence[PlacedLimb],
     stated: Mapping[str, Drive],
-    own: Iterable[Actuator] = (),
-    couplings: Mapping[str, Coupling] | None = None,
-    conditions: Mapping[str, Condition] | None = None,
-) -> PlacedRows:
-    """Return drives and couplings at their joints; those of limbs that are copied are one for each
-    copy. Raises RecordError where joints and rows do not fit.
+    own: Iterable[Actuator],
+    couplings: Mapping[str, Coupling],
+    conditions: Mapping[str, Condition],
+) -> tuple[tuple[PlacedLimb, ...], dict[str, PlacedRow], dict[str, PlacedRow]]:
+    """Return the limbs, with `limb.joint` as the drive of each passive joint that a sum names, and
+    by name drives in the order of the readings and couplings, those of limbs that are copied one
+    for each copy. Raises RecordError where joints and rows do not fit.
 
     A drive that several limbs name is one drive. stated : the drives of the file; one that is not
     listed reads the joint itself. own : what the family knows of its drives.
     """
     joints, known = find_driven_joints(limbs)
-    coupled = {
-        name: PlacedCoupling(name, coupling, names, reference)
-        for key, coupling in (couplings or {}).items()
-        for reference in [_find_reference(key, coupling, conditions or {})]
-        for name, names in _name_joints(key, coupling, PlacedCoupling, joints, known)
-    }
-    for condition in conditions or {}:
-        if all(row.drive.condition != condition for row in coupled.values()):
+    coupled = dict[str, PlacedRow]()
+    for key, coupling in couplings.items():
+        reference, base = _find_reference(key, coupling, conditions), Actuator(key, coupling.GIVEN)
+        for name, names in _name_joints(key, coupling, joints, known):
+            first = joints[next(iter(names.values()))]
+            coupled[name] = PlacedRow(name, coupling, names, first, base, reference)
+    for condition in conditions:
+        if all(coupling.condition != condition for coupling in couplings.values()):
             raise RecordError(
                 f"the condition {condition!r} is in no coupling. Name it there, or leave it out",
                 "conditions",
@@ -660,7 +609,7 @@ def place_rows(
     keys: dict[str, tuple[str | None, Mapping[str, str]]] = {
         name: (key, names)
         for key in sums
-        for name, names in _name_joints(key, stated[key], PlacedDrive, joints, known)
+        for name, names in _name_joints(key, stated[key], joints, known)
     }
     for name, joint in joints.items():
         key = next((key for key in (name, joint.stated) if key in stated), None)
@@ -669,14 +618,14 @@ def place_rows(
     if sums:  # the file states the order of the readings
         order = {key: i for i, key in enumerate(stated)}
         keys = dict(sorted(keys.items(), key=lambda item: order[item[1][0] or ""]))
-    base, drives = {actuator.name: actuator for actuator in own}, dict[str, PlacedDrive]()
+    of_family, drives = {actuator.name: actuator for actuator in own}, dict[str, PlacedRow]()
     for name, (key, names) in keys.items():
         joint = joints[next(iter(names.values()), name)]
         plain = AngleDrive(reads="angle") if joint.turns else LengthDrive(reads="length")
         drive = plain if key is None else stated[key]
-        from_family = base.get(name) or Actuator(name, drive.READING)
-        drives[name] = PlacedDrive(name, drive, names, joint, from_family)
-        _check_drive(drives[name])
+        base = of_family.get(name) or Actuator(name, drive.READING)
+        drives[name] = PlacedRow(name, drive, names, joint, base)
+        _check_drive(drives[name], drive)
     groups = {joint.stated for joint in joints.values() if not joint.is_passive}
     refuse_idle_drives(stated, drives, groups.union(sums))
     used = {joint for row in (*coupled.values(), *drives.values()) for joint in row.weights}
@@ -698,7 +647,7 @@ def place_rows(
         for limb in limbs
         for own in [limb.limb]
     )
-    return PlacedRows(tuple(placed), drives, coupled)
+    return tuple(placed), drives, coupled
 
 
 def find_driven_joints(
@@ -753,7 +702,6 @@ def _find_reference(key: str, coupling: Coupling, conditions: Mapping[str, Condi
 def _name_joints(
     key: str,
     stated: Drive | Coupling,
-    row: type[PlacedRow],
     joints: Mapping[str, DrivenJoint],
     known: Mapping[str, Sequence[str]],
 ) -> Iterator[tuple[str, Mapping[str, str]]]:
@@ -762,7 +710,7 @@ def _name_joints(
     """
 
     def refuse(sentence: str) -> RecordError:
-        return RecordError(f"{row.WORD} {key!r} {sentence}", row.SECTION, key)
+        return RecordError(f"{stated.WORD} {key!r} {sentence}", stated.SECTION, key)
 
     weights: dict[str, float] = {}
     names = [alias for part in list_parts(stated) for alias, _ in part.items]
@@ -828,7 +776,7 @@ def _check_rows(sums: Mapping[str, Mapping[str, float]], known: Mapping[str, str
             )
 
 
-def _word_stroke(placed: PlacedDrive) -> str:
+def _word_stroke(placed: PlacedRow) -> str:
     """Return what of the stroke of a triangle drive no angle reaches, or nothing."""
     if not isinstance(placed.drive, TriangleDrive):
         return ""
@@ -860,11 +808,11 @@ def refuse_idle_drives(
             )
 
 
-def _check_drive(placed: PlacedDrive) -> None:
+def _check_drive(placed: PlacedRow, drive: Drive) -> None:
     """Refuse a drive whose transmission does not give what its joint does, and a term that is
     stated or unknown and cannot be (DriveError).
     """
-    drive, name, turns = placed.drive, placed.name, placed.joint.turns
+    name, turns = placed.name, placed.joint.turns
     if turns != (drive.GIVEN is Dimension.ANGLE or isinstance(drive, TriangleDrive)):
         motion, allowed = (
             ("turns", "reads: angle without a radius, or a triangle")
@@ -893,12 +841,12 @@ def _check_drive(placed: PlacedDrive) -> None:
             name,
         )
     if drive.table:
-        _check_table(placed)
+        _check_table(placed, drive)
 
 
-def _check_table(placed: PlacedDrive) -> None:
+def _check_table(placed: PlacedRow, drive: Drive) -> None:
     """Refuse a table of one point, out of order, or with which a reading has two joint values."""
-    name, points = placed.name, np.array([reading for reading, _ in placed.drive.table])
+    name, points = placed.name, np.array([reading for reading, _ in drive.table])
     if not 2 <= len(points) <= MOST_POINTS or not (np.diff(points) > 0.0).all():
         raise DriveError(
             f"the table of actuator {name!r} has {len(points)} points. Give 2 to {MOST_POINTS} "

@@ -271,8 +271,8 @@ class Gough(RobotRecord):
         if self.error_model == "ideal":
             base_sd = standard_deviation(sd.base, "the base centers")
             platform_sd = standard_deviation(sd.platform, "the platform centers")
-            errors = point_errors(leg, leg.elements[0], base_sd, "base")
-            errors += point_errors(leg, "platform", platform_sd, "platform")
+            errors = point_errors(f"{leg.name}.base.", leg, leg.elements[0], base_sd)
+            errors += point_errors(f"{leg.name}.platform.", leg, "platform", platform_sd)
         if self.legs == "rod":
             return errors + rod_length_error(leg, name, length_sd)
         return errors + offset_error(

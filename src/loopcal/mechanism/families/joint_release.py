@@ -20,6 +20,7 @@ from loopcal.errors import MechanismError
 from loopcal.findings import Finding, report_finding
 from loopcal.mechanism.compilation import build
 from loopcal.mechanism.families.limbs import (
+    Axis,
     JointRecord,
     LimbRecord,
     Limbs,
@@ -31,6 +32,7 @@ from loopcal.mechanism.families.limbs import (
 )
 from loopcal.mechanism.families.placement import frame_from_axis
 from loopcal.mechanism.kinematics import compute_limb_frames, forward_trials
+from loopcal.mechanism.limb_rows import move_joint
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.over_constraint import (
     find_nearby_states,
@@ -117,37 +119,23 @@ def _list_candidates(robot: Mechanism, record: Limbs) -> Iterator[AddedJoint]:
         for place, joint in enumerate(limb.chain):
             element += {"U": 2, "C": 2, "S": 3}.get(joint.joint, 1)
             name = joint.name or names[element]
+            last: Axis = "x"  # of a ball
+            if not isinstance(joint, Spherical):
+                last = joint.axes[1] if isinstance(joint, Universal) else joint.axis
+            carried = frame_from_axis(axis_vector(last), f"joint {name!r}").T
             for added in _list_additions(joint, name):
-                axis = axis_vector(added.axis)
                 works = []
                 for i in members:
-                    T = frames[i][0, 0, element]
-                    turn, point = _follow_joint(robot, i, element, T, values[i][element])
-                    u = turn @ frame_from_axis(_last_axis(joint), f"joint {name!r}").T @ axis
+                    own = robot.assembly.limbs[i].joints[element]
+                    motion = np.array(values[i][element]), np.array(own.pitch)
+                    T = frames[i][0, 0, element] @ move_joint(own.kind, *motion)
+                    u = T[:3, :3] @ carried @ axis_vector(added.axis)
                     twist = np.concatenate([np.zeros(3), u])
                     if added.joint == "R":
-                        twist = np.concatenate([u, np.cross(u, centers[i] - point)])
+                        twist = np.concatenate([u, np.cross(u, centers[i] - T[:3, 3])])
                     # wrenches are those by freedoms over `scale`
                     works.append(stress[:, i] @ (twist / scale))
                 yield AddedJoint(limb.name, name, place, added, np.array(works).T)
-
-
-def _follow_joint(
-    robot: Mechanism, limb: int, element: int, T: FloatArray, value: float
-) -> tuple[FloatArray, FloatArray]:
-    """Return the rotation (3, 3) behind a joint and its point (3,), of the frame before it."""
-    turn, point = T[:3, :3], T[:3, 3]
-    if robot.assembly.limbs[limb].joints[element].kind == "P":
-        return turn, point + value * turn[:, 2]
-    c, s = np.cos(value), np.sin(value)
-    return turn @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]), point
-
-
-def _last_axis(joint: JointRecord) -> FloatArray:
-    """Return the axis of the last single joint of a record."""
-    if isinstance(joint, Spherical):
-        return axis_vector("x")
-    return axis_vector(joint.axes[1] if isinstance(joint, Universal) else joint.axis)
 
 
 def _list_additions(joint: JointRecord, name: str) -> Iterator[Revolute | Prismatic]:

@@ -46,7 +46,6 @@ from loopcal.mechanism.families.placement import (
     PoseRecord,
     displacement_error,
     join_errors,
-    map_displacement,
     map_slide_tilt,
     place_limb,
     rod_length_error,
@@ -291,9 +290,10 @@ class Limbs(RobotRecord):
         copies = [copy for limb in self.limbs for copy in _copies(limb, named)]
         placed = [limb for _, limb in copies]
         errors = join_errors(
-            _shifts(limb, entry) if isinstance(entry, Shifts) else _tilts(limb, entry)
+            error
             for record, limb in copies
             for entry in record.errors
+            for error in _list_errors(limb, entry)
         )
         assembly = self.assemble(
             placed,
@@ -485,36 +485,21 @@ def _place_joint(record: JointRecord, name: str, suffix: str) -> list[JointPlace
     return [JointPlacement(*step) for step in zip(joints, places, axes, strict=False)]
 
 
-def _shifts(limb: PlacedLimb, entry: Shifts) -> ErrorModel:
-    """Return the unknown lengths of a limb."""
-    sd, errors = standard_deviation(entry.tolerance, f"{limb.name} {entry.of}"), []
+def _list_errors(limb: PlacedLimb, entry: Shifts | Tilts) -> Iterator[ErrorModel]:
+    """Yield the unknown lengths or angles of a limb."""
+    sd = standard_deviation(entry.tolerance, f"{limb.name} {entry.of}")
     label = f"{limb.name}.{entry.name or entry.of}"
-    for axis in entry.shift:
+    for axis in entry.shift if isinstance(entry, Shifts) else entry.tilt:
+        name = f"{label}.{axis}"
         if axis == "length":
             if limb.limb.ending != "distance" or entry.of != "rod":
                 raise MechanismError(
                     f"{limb.name!r}: 'length' belongs to a rod. Write 'of: rod' in a limb that "
                     "ends in a distance"
                 )
-            name = label if entry.name else f"{limb.name}.length"
-            errors.append(rod_length_error(limb, name, sd))
-            continue
-        element = limb.find_element(entry.of)
-        place = limb.placements[element]
-        nominal = (place[:3, :3].T @ place[:3, 3])["xyz".index(axis)]
-        errors.append(displacement_error(f"{label}.{axis}", limb, element, axis, sd, nominal))
-    return join_errors(errors)
-
-
-def _tilts(limb: PlacedLimb, entry: Tilts) -> ErrorModel:
-    """Return the unknown angles of a limb."""
-    sd = standard_deviation(entry.tolerance, f"{limb.name} {entry.of}")
-    element, tilt = (
-        limb.find_element(entry.of),
-        map_slide_tilt if entry.alone else map_displacement,
-    )
-    names = {axis: f"{limb.name}.{entry.name or entry.of}.{axis}" for axis in entry.tilt}
-    return join_errors(
-        single_error(name, Dimension.ANGLE, 0.0, sd, *tilt(name, limb, element, axis))
-        for axis, name in names.items()
-    )
+            yield rod_length_error(limb, label if entry.name else f"{limb.name}.length", sd)
+        elif isinstance(entry, Tilts) and entry.alone:
+            maps = map_slide_tilt(name, limb, limb.find_element(entry.of), axis)
+            yield single_error(name, Dimension.ANGLE, 0.0, sd, *maps)
+        else:
+            yield displacement_error(name, limb, limb.find_element(entry.of), axis, sd)

@@ -145,11 +145,10 @@ def place_limb_with_ball(
     """
     if axes is None:
         return place_limb(name, steps, translate(*center), "ball", attachment)
-    ball = tuple(
-        JointPlacement(Joint(f"ball{i + 1}", "R"), place, axis)
-        for i, (place, axis) in enumerate(
-            ((geometry.make_pose(axes, center), EZ), (np.eye(4), EY), (np.eye(4), EX))
-        )
+    ball = (
+        JointPlacement(Joint("ball1", "R"), geometry.make_pose(axes, center), EZ),
+        JointPlacement(Joint("ball2", "R"), np.eye(4), EY),
+        JointPlacement(Joint("ball3", "R"), np.eye(4), EX),
     )
     return place_limb(name, (*steps, *ball), np.eye(4), "rigid", attachment)
 
@@ -319,23 +318,23 @@ def displacement_error(
     element: str,
     axis: str,
     tolerance: float | None,
-    nominal: float = 0.0,
     positive: bool = False,
 ) -> ErrorModel:
-    """Return a displacement of a link, of AXES in its carried frame, as a parameter."""
-    maps = map_displacement(name, limb, element, axis)
-    dimension = get_axis_dimension(axis)
-    return single_error(name, dimension, nominal, tolerance, *maps, positive=positive)
-
-
-def point_errors(limb: PlacedLimb, element: str, tolerance: float | None, label: str) -> ErrorModel:
-    """Return the coordinates of a link's origin in the frame carried before it as parameters
-    `limb.label.x`, `.y` and `.z`, of a placement that is not rotated.
+    """Return a displacement of a link, of AXES in its carried frame, as a parameter; the nominal
+    value of a translation is that of the placement of the link.
     """
-    point = limb.placements[element][:3, 3]
+    maps, place = map_displacement(name, limb, element, axis), limb.placements[element]
+    at = np.concatenate([np.zeros(3), place[:3, :3].T @ place[:3, 3]])[AXES.index(axis)]
+    dimension = get_axis_dimension(axis)
+    return single_error(name, dimension, at, tolerance, *maps, positive=positive)
+
+
+def point_errors(
+    prefix: str, limb: PlacedLimb, element: str, tolerance: float | None, axes: str = "xyz"
+) -> ErrorModel:
+    """Return coordinates of a link's origin, with the prefix before their names, as parameters."""
     return join_errors(
-        displacement_error(f"{limb.name}.{label}.{axis}", limb, element, axis, tolerance, nominal)
-        for axis, nominal in zip(AXES[3:], point, strict=True)
+        displacement_error(f"{prefix}{axis}", limb, element, axis, tolerance) for axis in axes
     )
 
 
@@ -363,23 +362,18 @@ def complete_errors(limb: PlacedLimb, spread: ErrorTolerances, places_body: bool
     """Return all errors of the links of a limb. Those of an attachment that `places_body` are none:
     they move the frame of the body.
     """
-    errors: list[ErrorModel] = []
-
-    def add_displacements(element: str, axes: Iterable[str]) -> None:
-        for axis in axes:
-            name, dimension = f"{limb.name}.{element}.{axis}", get_axis_dimension(axis)
-            address = Address(limb.name, element, axis)
-            sd = spread.select(dimension)
-            errors.append(single_error(name, dimension, 0.0, sd, LinearMap(name, address)))
-
-    for joint in limb.limb.joints:
-        add_displacements(joint.name, KEPT_AXES[joint.kind])
-    if limb.limb.ending != "rigid":
-        add_displacements(limb.limb.links[-1].name, AXES[3:])
+    own, is_rigid = limb.limb, limb.limb.ending == "rigid"
+    chosen = [(joint.name, KEPT_AXES[joint.kind]) for joint in own.joints]
+    if not is_rigid:
+        chosen.append((own.links[-1].name, AXES[3:]))
     if not places_body:
-        end = limb.limb.attachment.name
-        add_displacements(end, AXES if limb.limb.ending == "rigid" else AXES[3:])
-    if limb.limb.ending == "distance" and not limb.limb.actuator:
+        chosen.append((own.attachment.name, AXES if is_rigid else AXES[3:]))
+    errors: list[ErrorModel] = []
+    for element, axis in ((element, axis) for element, axes in chosen for axis in axes):
+        name, dimension = f"{limb.name}.{element}.{axis}", get_axis_dimension(axis)
+        entry = LinearMap(name, Address(limb.name, element, axis))
+        errors.append(single_error(name, dimension, 0.0, spread.select(dimension), entry))
+    if own.ending == "distance" and not own.actuator:
         errors.append(rod_length_error(limb, f"{limb.name}.length", spread.length))
     return join_errors(errors)
 

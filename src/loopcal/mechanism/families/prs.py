@@ -36,6 +36,7 @@ from loopcal.mechanism.families.placement import (
     offset_error,
     place_limb,
     place_limb_with_ball,
+    point_errors,
     rod_length_error,
     rotate_about,
     single_error,
@@ -120,7 +121,6 @@ def build_pus_limb(name: str, motor: str, frames: ChainFrames, axes: bool) -> Pl
 def carriage_errors(
     limb: PlacedLimb,
     number: int,
-    frames: ChainFrames,
     spread: ErrorTolerances,
     *,
     foot: str = "xy",
@@ -134,23 +134,14 @@ def carriage_errors(
     foot, guide, joint : axes of b, thB and thC. The z coordinate of b has the same effect as q.
     """
     length, angle = spread.length, spread.angle
-    errors = []
-    for letter, element, frame, axes in (
-        ("a", "platform", frames.platform, "xyz"),
-        ("b", "guide", frames.base, foot),
-    ):
-        point = frame[:3, :3].T @ frame[:3, 3]
-        for axis in axes:
-            name, nominal = f"{letter}{number}{axis}", point["xyz".index(axis)]
-            errors.append(displacement_error(name, limb, element, axis, length, nominal))
+    errors = [point_errors(f"a{number}", limb, "platform", length)]
+    errors.append(point_errors(f"b{number}", limb, "guide", length, foot))
     (motor,), rod = limb.limb.drives, f"l{number}"
     errors.append(offset_error(f"q{number}", motor, Dimension.LENGTH, 0.0, length))
     if limb.limb.ending == "distance":
         errors.append(rod_length_error(limb, rod, length))
     else:
-        errors.append(
-            displacement_error(rod, limb, "tip", "z", length, frames.length, positive=True)
-        )
+        errors.append(displacement_error(rod, limb, "tip", "z", length, positive=True))
     # a tilt of the guide does not rotate a joint on the carriage
     tilt = map_slide_tilt if len(limb.limb.joints) > 1 else map_displacement
     for axis in guide:
@@ -256,9 +247,9 @@ class RuPusPrs(CarriageRobot):
         )
 
         def list_errors() -> Iterator[ErrorModel]:
-            yield carriage_errors(limbs[0], 1, first, spread)
-            yield carriage_errors(limbs[1], 2, second, spread, joint="yz")
-            of_post = limbs[2], "universal1", "z", spread.length, self.post
+            yield carriage_errors(limbs[0], 1, spread)
+            yield carriage_errors(limbs[1], 2, spread, joint="yz")
+            of_post = limbs[2], "universal1", "z", spread.length
             yield displacement_error("r", *of_post, positive=True)
             left_out = LEFT_OUT if self.parameter_set == "twenty-five" else ()
             for name, element, axis in POST_ANGLES:
@@ -297,8 +288,5 @@ class ThreePrs(CarriageRobot):
         chosen = {"foot": "xyz", "guide": "xyz", "joint": "xyz"}
         if self.parameter_set == "eleven":
             chosen = {"joint": "xz"}
-        errors = (
-            carriage_errors(limb, k, own, spread, **chosen)
-            for k, (limb, own) in enumerate(zip(limbs, frames, strict=True), 1)
-        )
+        errors = (carriage_errors(limb, k, spread, **chosen) for k, limb in enumerate(limbs, 1))
         return self.join(limbs, errors, "z", "phi", "theta")

@@ -76,14 +76,29 @@ class MapEntry:
 
 
 @dataclass(frozen=True)
-class NamedLength:
+class NamedRecord:
+    """A parameter of one's own."""
+
+    GIVEN: ClassVar[Dimension] = Dimension.RATIO
+
+    name: str
+
+    @property
+    def nominal(self) -> float:
+        """Nominal value [SI]."""
+        return float(getattr(self, self.GIVEN.value))
+
+
+@dataclass(frozen=True)
+class NamedLength(NamedRecord):
     """A named parameter that is a length, with its nominal value.
 
     `positive: true` says that no machine has it at zero or below, such as a radius. It is always so
     where a nominal value above zero is mapped onto a rod's length, a lead or a gain.
     """
 
-    name: str
+    GIVEN = Dimension.LENGTH
+
     length: Length
     maps: tuple[MapEntry, ...]
     tolerance: LengthTolerance | None = None
@@ -91,20 +106,20 @@ class NamedLength:
 
 
 @dataclass(frozen=True)
-class NamedAngle:
+class NamedAngle(NamedRecord):
     """A named parameter that is an angle, with its nominal value."""
 
-    name: str
+    GIVEN = Dimension.ANGLE
+
     angle: Angle
     maps: tuple[MapEntry, ...]
     tolerance: AngleTolerance | None = None
 
 
 @dataclass(frozen=True)
-class NamedRatio:
+class NamedRatio(NamedRecord):
     """A named parameter without dimension, with its nominal value."""
 
-    name: str
     ratio: Ratio
     maps: tuple[MapEntry, ...]
     tolerance: RatioTolerance | None = None
@@ -113,85 +128,47 @@ class NamedRatio:
 NamedParameter = NamedLength | NamedAngle | NamedRatio
 
 
-def get_quantity(named: NamedParameter) -> tuple[Dimension, float]:
-    """Return the dimension and the nominal value [SI] of a named parameter."""
-    if isinstance(named, NamedLength):
-        return Dimension.LENGTH, named.length
-    if isinstance(named, NamedAngle):
-        return Dimension.ANGLE, named.angle
-    return Dimension.RATIO, named.ratio
-
-
-def is_always_positive(named: NamedParameter) -> bool:
-    """Return whether only values above zero of a named parameter exist, if its nominal value is."""
-    is_stated = isinstance(named, NamedLength) and named.positive
-    nominal = get_quantity(named)[1]
-    if is_stated and not nominal > 0.0:
-        raise MechanismError(
-            f"parameter {named.name!r} must be positive, but its nominal value is "
-            f"{nominal * 1e3:g} mm. Correct the value, or leave out 'positive'"
-        )
-    return is_stated or any(entry.axis in POSITIVE for entry in named.maps)
-
-
-def find_engine_axis(name: str, entry: MapEntry) -> tuple[str, float]:
-    """Return the engine's axis of a map entry and the change of it per unit of the parameter: a
-    file states a lead per turn, the engine a pitch per radian.
-    """
-    if entry.axis == "pitch":
-        raise MechanismError(
-            f"parameter {name!r} maps onto 'pitch'. Use lead, the advance in one turn"
-        )
-    coefficient = entry.coefficient * (1.0 if entry.arm is None else entry.arm)
-    if entry.axis == "lead":
-        return "pitch", coefficient * (1 / (2 * np.pi))
-    return entry.axis, coefficient
-
-
-def check_units(named: NamedParameter, entry: MapEntry, drive: PlacedRow | None) -> None:
-    """Refuse a map between unlike units, onto the drive that the entry names; a ratio is a slope
-    for an angle.
-    """
-    (dimension, _), axis = get_quantity(named), entry.axis
-    if drive is None or axis not in ("offset", "backlash", "gain", "curve"):
-        needed = Dimension.ANGLE if axis in AXES[:3] else Dimension.LENGTH
-    elif axis in ("gain", "curve"):  # per unit of the reading
-        needed = (
-            Dimension.LENGTH
-            if isinstance(drive.drive, SpoolDrive | ScrewDrive)
-            else Dimension.RATIO
-        )
-    else:
-        needed = drive.dimension
-    what = f"parameter {named.name!r} is {ARTICLES[dimension]}"
-    onto = f"{entry.axis} of {entry.limb!r} {ARTICLES[needed]}"
-    if entry.arm is not None:
-        if dimension is Dimension.LENGTH:
-            raise MechanismError(
-                f"{what} with an arm. Leave the arm out, which turns an angle into a length"
-            )
-        if needed is not Dimension.LENGTH:
-            raise MechanismError(f"{what} with an arm and {onto}. Leave the arm out")
-        return
-    slope = dimension is Dimension.RATIO and needed is Dimension.ANGLE
-    if dimension is needed or slope:
-        return
-    if needed is Dimension.LENGTH:
-        raise MechanismError(
-            f"{what} and {onto}. Give an `arm:` [length per radian], or the parameter as a length"
-        )
-    raise MechanismError(f"{what} and {onto}. Give it as {ARTICLES[needed]}")
-
-
 def named_error(
     named: NamedParameter, limbs: Sequence[PlacedLimb], drives: Mapping[str, PlacedRow]
 ) -> ErrorModel:
     """Return a named parameter with its maps onto limbs and drives."""
-    dimension, nominal = get_quantity(named)
-    sd = standard_deviation(named.tolerance, named.name)
+    name, nominal, is_positive = named.name, named.nominal, getattr(named, "positive", False)
+    if is_positive and not nominal > 0.0:
+        raise MechanismError(
+            f"parameter {name!r} must be positive, but its nominal value is {nominal * 1e3:g} mm. "
+            "Correct the value, or leave out 'positive'"
+        )
+    is_positive = is_positive or any(entry.axis in POSITIVE for entry in named.maps)
+    sd = standard_deviation(named.tolerance, name)
     maps = [m for entry in named.maps for m in _map_entry(named, entry, limbs, drives)]
-    is_positive = is_always_positive(named)
-    return single_error(named.name, dimension, nominal, sd, *maps, positive=is_positive)
+    return single_error(name, named.GIVEN, nominal, sd, *maps, positive=is_positive)
+
+
+def _check_units(named: NamedParameter, entry: MapEntry, drive: PlacedRow | None) -> None:
+    """Refuse a map between unlike units, onto the drive that the entry names; a ratio is a slope
+    for an angle.
+    """
+    dimension, axis, length = named.GIVEN, entry.axis, Dimension.LENGTH
+    needed = Dimension.ANGLE if axis in AXES[:3] else length
+    if drive is not None and axis in ("offset", "backlash"):
+        needed = drive.drive.GIVEN
+    elif drive is not None and axis in ("gain", "curve"):  # per unit of the reading
+        moves_length = isinstance(drive.drive, SpoolDrive | ScrewDrive)
+        needed = length if moves_length else Dimension.RATIO
+    what = f"parameter {named.name!r} is {ARTICLES[dimension]}"
+    onto = f"{entry.axis} of {entry.limb!r} {ARTICLES[needed]}"
+    if entry.arm is not None and dimension is length:
+        raise MechanismError(
+            f"{what} with an arm. Leave the arm out, which turns an angle into a length"
+        )
+    if entry.arm is not None and needed is not length:
+        raise MechanismError(f"{what} with an arm and {onto}. Leave the arm out")
+    slope = dimension is Dimension.RATIO and needed is Dimension.ANGLE
+    if entry.arm is None and dimension is not needed and not slope:
+        remedy = f"it as {ARTICLES[needed]}"
+        if needed is length:
+            remedy = "an `arm:` [length per radian], or the parameter as a length"
+        raise MechanismError(f"{what} and {onto}. Give {remedy}")
 
 
 def _map_entry(
@@ -200,9 +177,18 @@ def _map_entry(
     limbs: Sequence[PlacedLimb],
     drives: Mapping[str, PlacedRow],
 ) -> Iterator[LinearMap]:
-    """Yield the maps of one entry, for every copy that it means."""
-    name, (axis, coefficient) = named.name, find_engine_axis(named.name, entry)
-    check_units(named, entry, drives.get(entry.limb))
+    """Yield the maps of one entry, for every copy that it means. A file states a lead per turn, the
+    engine a pitch per radian.
+    """
+    name, axis = named.name, entry.axis
+    coefficient = entry.coefficient * (1.0 if entry.arm is None else entry.arm)
+    if axis == "pitch":
+        raise MechanismError(
+            f"parameter {name!r} maps onto 'pitch'. Use lead, the advance in one turn"
+        )
+    if axis == "lead":
+        axis, coefficient = "pitch", coefficient * (1 / (2 * np.pi))
+    _check_units(named, entry, drives.get(entry.limb))
     # a limb and a drive may have one name; only a limb has links with axes
     if entry.limb in drives and axis not in AXES:
         scale = drives[entry.limb].sense * coefficient

@@ -441,6 +441,4 @@ def _joint_error(
     sd = standard_deviation(record.angle if turns else record.length, error)
     if error == "offset":
         return offset_error(error, drive, record.GIVEN, 0.0, sd)
-    place = limb.placements[LINK]
-    at = 0.0 if turns else float((place[:3, :3].T @ place[:3, 3])["xyz".index(error)])
-    return displacement_error(error, limb, LINK, error, sd, at)
+    return displacement_error(error, limb, LINK, error, sd)
