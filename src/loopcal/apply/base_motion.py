@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from itertools import compress
 from typing import Any
 
 import numpy as np
@@ -29,7 +30,7 @@ from loopcal.geometry import (
 )
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.solutions import forward
-from loopcal.typing import FloatArray
+from loopcal.typing import BoolArray, FloatArray
 
 VISIBLE = 5e-4  # root mean square motion, in sizes of the robot, from which it is stated
 SAME = 1e-3  # largest remaining share of a motion that other values make exactly
@@ -67,6 +68,9 @@ def find_base_motion(
     allowed = np.repeat([frame in frames for frame in FRAMES], 6)
     if is_planar:
         allowed[[0, 1, *range(5, 12)]] = False
+    is_turning = min(robot.program.freedoms) < 3
+    if not is_turning and allowed[:6].any():  # a tool's place moves all poses as the base does
+        allowed[6:] = False
     if not allowed.any():
         return None, None
     readings = probe_readings(robot)
@@ -76,54 +80,67 @@ def find_base_motion(
         return None, None
     readings = readings[usable]
     arms = np.zeros((1, 3))
-    if min(robot.program.freedoms) < 3:  # it rotates: three more points of it
+    if is_turning:  # three more points of it
         arms = np.concatenate([arms, 0.25 * robot.size * np.eye(3)])
 
-    def place(T: FloatArray) -> FloatArray:
-        """Return the points (n r, 3) of poses."""
-        return (arms @ T[:, :3, :3].transpose(0, 2, 1) + T[:, None, :3, 3]).reshape(-1, 3)
-
-    def list_rows(T: FloatArray, twists: FloatArray) -> FloatArray:
-        """Return the motions (n r 3, k) of the points by twists (n, 6, k) of poses."""
-        arm = (arms @ T[:, :3, :3].transpose(0, 2, 1))[..., None]
-        rows = twists[:, None, 3:] + np.cross(twists[:, None, :3], arm, axis=2)
-        return rows.reshape(-1, twists.shape[-1])
-
     T = new.T[usable]
-    points, reference = place(T), place(old.T[usable])
     level = np.array([1.0, 1.0, 0.0 if is_planar else 1.0])
-    M, P = np.eye(4), np.eye(4)
-    for _ in range(STEPS):
-        J = list_rows(M @ T @ P, differentiate_by_frames(M @ T @ P)[..., allowed])
-        step = np.zeros(12)
-        left = (reference - place(M @ T @ P)) * level
-        step[allowed] = _solve(J * np.tile(level, len(points))[:, None], left.ravel())
-        M = make_pose(exp_so3(step[:3]), step[3:6]) @ M
-        P = P @ make_pose(exp_so3(step[6:9]), step[9:])
-    moved = place(M @ T @ P) - points
+    M, P = _fit_motions(T, old.T[usable], arms, level, allowed)
+    points = _place(T, arms)
+    moved = _place(M @ T @ P, arms) - points
     if np.sqrt((moved**2).sum(axis=1).mean()) < VISIBLE * robot.size:
         return None, None
     keeps, kept = "", None
     for word, share in (("both", 1.0), ("turn", 0.0)):
         before, after = (make_pose(F[:3, :3], share * F[:3, 3]) for F in (M, P))
-        wanted, trial = place(before @ T @ after), robot
+        wanted, trial = _place(before @ T @ after, arms), robot
         for _ in range(STEPS):
             reached, twist = observe_motions(trial, readings)
             if len(reached) < len(readings):
                 break
-            step = _solve(list_rows(reached, twist), (wanted - place(reached)).ravel())
+            J = _list_rows(reached, twist, arms)
+            step = _solve(J, (wanted - _place(reached, arms)).ravel())
             trial = trial.with_values(trial.values + step)
-        rest = np.linalg.norm(wanted - place(forward(trial, readings).T))
+        rest = np.linalg.norm(wanted - _place(forward(trial, readings).T, arms))
         if rest < SAME * np.linalg.norm(wanted - points):
             keeps, kept = word, trial
             break
-    sizes: dict[str, Any] = {"keeps": keeps, "frames": tuple(f for f in FRAMES if f in frames)}
+    sizes: dict[str, Any] = {"keeps": keeps, "frames": [*compress(FRAMES, allowed[[3, 9]])]}
     for frame, F in zip(FRAMES, (M, P), strict=True):
         angle, length = (float(np.linalg.norm(v)) for v in (log_so3(F[:3, :3]), F[:3, 3]))
         is_moved = angle * robot.size + length > ROUNDING * robot.size
         sizes[f"{frame}_turn"] = Quantity(math.degrees(angle), "deg") if is_moved else 0
         sizes[f"{frame}_shift"] = Quantity(1e3 * length, "mm") if is_moved else 0
     return report_finding("files.base-moves", **sizes), kept
+
+
+def _place(T: FloatArray, arms: FloatArray) -> FloatArray:
+    """Return the points (n r, 3) of poses (n, 4, 4) at arms (r, 3) from their origin [m]."""
+    return (arms @ T[:, :3, :3].transpose(0, 2, 1) + T[:, None, :3, 3]).reshape(-1, 3)
+
+
+def _list_rows(T: FloatArray, twists: FloatArray, arms: FloatArray) -> FloatArray:
+    """Return the motions (n r 3, k) of the points by twists (n, 6, k) of poses."""
+    arm = (arms @ T[:, :3, :3].transpose(0, 2, 1))[..., None]
+    rows = twists[:, None, 3:] + np.cross(twists[:, None, :3], arm, axis=2)
+    return rows.reshape(-1, twists.shape[-1])
+
+
+def _fit_motions(
+    T: FloatArray, reference: FloatArray, arms: FloatArray, level: FloatArray, allowed: BoolArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the motions M and P for which M T P is nearest to reference poses, of those that are
+    allowed (12,); `level` (3,) weighs directions.
+    """
+    M, P = np.eye(4), np.eye(4)
+    for _ in range(STEPS):
+        moved, step = M @ T @ P, np.zeros(12)
+        J = _list_rows(moved, differentiate_by_frames(moved)[..., allowed], arms)
+        left = (_place(reference, arms) - _place(moved, arms)) * level
+        step[allowed] = _solve(J * np.tile(level, len(left))[:, None], left.ravel())
+        M = make_pose(exp_so3(step[:3]), step[3:6]) @ M
+        P = P @ make_pose(exp_so3(step[6:9]), step[9:])
+    return M, P
 
 
 def _solve(J: FloatArray, left: FloatArray) -> FloatArray:

@@ -436,11 +436,10 @@ def compare_stored_geometry(robot: Mechanism, measured: Measurements) -> StoredA
         return None  # fewer probes than parameters, or a geometry that cannot reach them
     if not fit.converged or fit.rank < len(fit.names):
         return None
-    is_angle = np.array([name.endswith(".angle") for name in fit.names])
-    unit = np.where(is_angle, np.pi / 180.0, MM)
-    stored = fit.initial.values[fit.free_parameters.places] / unit
-    best = fit.estimate / unit
-    symbols = ["deg" if angle else "mm" for angle in is_angle]
+    units = [robot.get_unit(dimension) for dimension in fit.free_parameters.dimensions]
+    scale = np.array([unit.factor_to_si for unit in units])
+    stored = fit.initial.values[fit.free_parameters.places] / scale
+    best, symbols = fit.estimate / scale, [unit.symbol for unit in units]
     return StoredAnswer(
         float(fit.history.cost[0]),
         float(fit.history.cost[-1]),

@@ -15,7 +15,9 @@ from __future__ import annotations
 
 import csv
 import io
+from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -32,6 +34,10 @@ from loopcal.mechanism.platform_coordinates import get_dimension
 from loopcal.typing import FloatArray
 from loopcal.units import UNITS, Dimension
 
+if TYPE_CHECKING:
+    from loopcal.apply.correction_tables import What
+
+Writer = Callable[[ExportSource, Path | None], Exported]
 PROFILE = "loopcal"
 DIGITS = 9
 """Significant digits of a CSV file: of a meter, a nanometer."""
@@ -119,31 +125,14 @@ def write_compensation(source: ExportSource, into: Path | None) -> Exported:
     return Exported("\n".join(lines) + "\n", notes, files)
 
 
-GRID = Format(
-    "grid",
-    "corrections over a grid, as CSV",
-    write=write_grid,
-    takes_file=False,
-    table=("commands", 20000, 500),
-)
-KLIPPER = Format(
-    "grid-klipper",
-    "height map of Klipper",
-    write=write_mesh,
-    takes_file=False,
-    table=("height", 10000, 99),
-)
-REPRAP = Format(
-    "grid-reprap",
-    "heightmap.csv of RepRapFirmware",
-    write=write_height_map,
-    takes_file=False,
-    table=("height", 441, 41),
-)
-COMPENSATION = Format(
-    "grid-linuxcnc",
-    "compensation files of LinuxCNC's joints",
-    write=write_compensation,
-    takes_file=False,
-    table=("readings", 256, 256),
+def _describe(name: str, what: str, write: Writer, table: tuple[What, int, int]) -> Format:
+    """Return the format of a table."""
+    return Format(name, what, (), None, write, takes_file=False, table=table)
+
+
+GRID = _describe("grid", "corrections over a grid, as CSV", write_grid, ("commands", 20000, 500))
+KLIPPER = _describe("grid-klipper", "height map of Klipper", write_mesh, ("height", 10000, 99))
+REPRAP = _describe("grid-reprap", "heightmap.csv", write_height_map, ("height", 441, 41))
+COMPENSATION = _describe(
+    "grid-linuxcnc", "LinuxCNC COMP_FILE", write_compensation, ("readings", 256, 256)
 )

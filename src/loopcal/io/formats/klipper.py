@@ -11,20 +11,29 @@ full_steps_per_rotation * gear_ratio), or older `step_distance`. [delta_calibrat
 (`height0`, `height0_pos`, also `manual_height0`) and distances (`distance0`, `distance0_pos1`,
 `distance0_pos2`). Source: the documents "Configuration reference", "G-Codes" (SAVE_CONFIG) and
 "Delta calibrate" of Klipper, and how its configfile module reads the two parts.
+
+Of a rotary delta, motor k at `angle` turns an upper arm in the plane of the z axis, by t upwards
+from outwards: its elbow is at `shoulder_radius` + `upper_arm_length` cos t from the axis, at the
+height `shoulder_height` + `upper_arm_length` sin t, and `lower_arm_length` from the nozzle. At its
+end stop it leads the nozzle to (0, 0, `position_endstop`). Steps are angles. Source: Klipper's
+"Configuration reference" and its module rotary_delta.
 """
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from loopcal.errors import FileError
 from loopcal.findings import Quantity, report_finding
 from loopcal.io.core.csv_table import parse_finite
+from loopcal.io.core.yaml_file import format_yaml
 from loopcal.io.formats.delta_gcode import (
     NOMINAL_ANGLES,
     DeltaGeometry,
@@ -43,6 +52,9 @@ from loopcal.io.formats.program_format import (
     Name,
     Value,
     ValueFile,
+    format_head,
+    round_digits,
+    round_length,
     shorten_numbers,
 )
 
@@ -134,13 +146,13 @@ class KlipperConfig(ValueFile):
         lines += [*first, f"{MARK} [{section}]{end}", line]
 
 
-def read_config(path: Path) -> KlipperConfig:
+def read_config(path: Path, allowed: Sequence[str] = ("delta", "rotary_delta")) -> KlipperConfig:
     """Read a configuration; FileError where its saved part was edited, or it is of no delta."""
     cfg = KlipperConfig.load(path)
     is_stated = cfg.has("printer", "kinematics")
     kinematics = cfg.text("printer", "kinematics") if is_stated else ""
     sections = tuple(dict.fromkeys(section for section, _ in cfg.values))
-    if kinematics == "delta" or (not is_stated and (cfg.includes or STEPPERS[0] in sections)):
+    if kinematics in allowed or (not is_stated and (cfg.includes or STEPPERS[0] in sections)):
         return cfg
     raise cfg.error(report_kinematics(kinematics, sections[:4]), "printer", "kinematics")
 
@@ -164,10 +176,14 @@ def read(path: Path, options: ImportOptions) -> Imported:
         positions[option] = _parse_steps(cfg, option)
     values = {record: cfg.number(PROBED, record) * MM for record in (*heights, *distances)}
     program = "a printer.cfg of Klipper"
-    text = format_robot(parse_geometry(cfg), options, path, program, bool(distances))
+    is_rotary = cfg.values.get(("printer", "kinematics"), Value("", 0, 0)).text == "rotary_delta"
+    if is_rotary:
+        text = format_rotary(cfg, options, path, bool(distances))
+    else:
+        text = format_robot(parse_geometry(cfg), options, path, program, bool(distances))
     if not positions:
         return Imported(text, None, (report_finding("files.no-probed-heights"),))
-    steps = [get_step_distance(cfg, section) for section in STEPPERS]
+    steps = [get_step_distance(cfg, section, is_rotary) for section in STEPPERS]
     finding = report_finding(
         "files.probe-noise-assumed",
         heights=len(heights),
@@ -186,7 +202,7 @@ def read(path: Path, options: ImportOptions) -> Imported:
         )
         if records
     )
-    readings = np.array(list(positions.values())) * np.array(steps) * MM
+    readings = np.array(list(positions.values())) * np.array(steps) * (1.0 if is_rotary else MM)
     measurements = Measurements(options.name, readings, observations, labels=labels)
     return Imported(text, measurements, (finding,))
 
@@ -204,12 +220,103 @@ def parse_geometry(cfg: KlipperConfig) -> DeltaGeometry:
     )
 
 
-def get_step_distance(cfg: KlipperConfig, section: str) -> float:
-    """Return the length of one motor step [mm]; the gear ratio `57:11, 2:1` is 57 / 11 * 2."""
-    has_rotation = cfg.has(section, "rotation_distance")
+ROTARY_ANGLES = (30.0, 150.0, 270.0)
+"""Angles of the motors of a rotary delta by default [deg]."""
+ROTARY_PARTS = ("{}.offset", "angle_{}.offset", "arm_{}.tip.x", "arm_{}.length")
+"""Parameters of an arm, by its letter: end stop, angle of the motor, upper and lower arm."""
+
+
+def format_rotary(
+    cfg: KlipperConfig, options: ImportOptions, path: Path, has_distances: bool
+) -> str:
+    """Return the robot file of a rotary delta. Free is what Klipper's own calibration adjusts, and
+    the arms if the options state how accurately they were measured.
+    """
+    radius, height = (cfg.positive("printer", f"shoulder_{name}") for name in ("radius", "height"))
+    arms = [cfg.positive(STEPPERS[0], f"{part}_arm_length") for part in ("upper", "lower")]
+    first = (*arms, cfg.number(STEPPERS[0], "position_endstop"))
+    tolerance: dict[str, Any] = {}
+    if options.sigma_tape is not None:
+        tolerance = {"tolerance": {"sd": round_digits(options.sigma_tape / MM)}}
+    errors = [{"of": of, "shift": [s], **tolerance} for of, s in (("tip", "x"), ("rod", "length"))]
+    drives, couplings, limbs = dict[str, Any](), dict[str, Any](), list[dict[str, Any]]()
+    for section, nominal in zip(STEPPERS, ROTARY_ANGLES, strict=True):
+        k, angle = section[-1], cfg.number(section, "angle", nominal)
+        names = ("upper_arm_length", "lower_arm_length", "position_endstop")
+        upper, lower, stop = map(cfg.number, [section] * 3, names, first)
+        at_stop, at_bed = (-_raise_arm(radius, z - height, upper, lower) for z in (stop, 0.0))
+        if not math.isfinite(at_stop + at_bed):
+            found = report_finding("files.arms-out-of-reach", section=section, stop=stop)
+            raise cfg.error(found, section, "position_endstop")
+        drives[k] = {"reads": "angle", "offset": at_stop, "unknown": ["offset"]}
+        turn = {"sum": {f"arm_{k}.angle": 1}, "offset": angle, "unknown": ["offset"]}
+        couplings[f"angle_{k}"] = turn
+        shoulder = {"joint": "R", "name": "shoulder", "at": [radius, 0, height], "axis": "y"}
+        shoulder |= {"actuated": k, "start": at_bed}
+        chain = [{"joint": "R", "name": "angle", "axis": "z", "start": angle}, shoulder]
+        limb = {"name": f"arm_{k}", "chain": chain, "tip": [upper, 0, 0], "ending": "distance"}
+        limbs.append(limb | {"length": lower, "errors": errors})
+    fixed = [] if tolerance else ["arm_*.tip.x", "arm_*.length"]
+    fixed += ["angle_c.offset"] if has_distances else ["angle_*.offset", "shoulder_radius"]
+    half, axes = round_length(0.4 * min(radius + arms[0], arms[1] - radius)), ["x", "y", "z"]
+    places = [{"limb": limb["name"], "element": "shoulder"} for limb in limbs]
+    content = {"freedoms": axes, "controlled": axes, "drives": drives, "couplings": couplings}
+    content |= {"limbs": limbs, "fixed": fixed, "home": {"z": 0}}
+    content["parameters"] = [
+        {"name": name, "length": value, "maps": [{**place, "axis": axis} for place in places]}
+        for name, value, axis in (
+            ("shoulder_radius", radius, "x"),
+            ("shoulder_height", height, "z"),
+        )
+    ]
+    content["workspace"] = {"x": [-half, half], "y": [-half, half], "z": [0, half]}
+    what = "a printer.cfg of Klipper, kinematics rotary_delta"
+    remark = "Readings are the angles of the arms below their end stops."
+    return format_head(path, what, "limbs", options.name, ("mm", "deg"), remark) + format_yaml(
+        content
+    )
+
+
+def _raise_arm(radius: float, depth: float, upper: float, lower: float) -> float:
+    """Return the angle [deg] of an upper arm whose shoulder is at a radius [mm], with the nozzle on
+    the axis at a depth below it (negative); NaN where the arms do not reach.
+    """
+    reach = math.hypot(radius, depth)
+    cosine = (upper**2 + reach**2 - lower**2) / (2 * upper * reach)
+    bend = math.acos(cosine) if abs(cosine) <= 1 else math.nan
+    return math.degrees(math.atan2(depth, -radius) + bend)
+
+
+def _list_rotary(source: ExportSource) -> dict[Name, float | str]:
+    """Return the options of a rotary delta."""
+    values, wanted = source.values(), dict[Name, float | str]()
+
+    def show(number: float, name: str, factor: float = MM) -> float:
+        return source.round_number(number / factor, name, factor, DECIMALS)
+
+    for name in ("shoulder_radius", "shoulder_height"):
+        wanted["printer", name] = show(values[name], name)
+    for section in STEPPERS:
+        names = [part.format(section[-1]) for part in ROTARY_PARTS]
+        offset, angle, upper, lower = (values[name] for name in names)
+        x = values["shoulder_radius"] + upper * math.cos(offset)
+        z = values["shoulder_height"] - upper * math.sin(offset) - math.sqrt(lower**2 - x**2)
+        wanted[section, "angle"] = show(angle, names[1], math.radians(1))
+        wanted[section, "upper_arm_length"] = show(upper, names[2])
+        wanted[section, "lower_arm_length"] = show(lower, names[3])
+        stop = source.round_number(z / MM, names[0], MM / upper, DECIMALS)
+        wanted[section, "position_endstop"] = stop
+    return wanted
+
+
+def get_step_distance(cfg: KlipperConfig, section: str, is_rotary: bool = False) -> float:
+    """Return the path of one motor step [mm], the angle [rad] of a rotary delta; the gear ratio
+    `57:11, 2:1` is 57 / 11 * 2.
+    """
+    has_rotation = is_rotary or cfg.has(section, "rotation_distance")
     if not has_rotation and cfg.has(section, "step_distance"):
         return cfg.positive(section, "step_distance")
-    rotation = cfg.positive(section, "rotation_distance")
+    rotation = math.tau if is_rotary else cfg.positive(section, "rotation_distance")
     steps = cfg.positive(section, "microsteps")
     steps *= cfg.positive(section, "full_steps_per_rotation", 200.0)
     if not cfg.has(section, "gear_ratio"):
@@ -263,18 +370,25 @@ def write(source: ExportSource, into: Path | None) -> Exported:
     People change options where they are, because an option of the main part would hide one of a
     pasted block.
     """
-    geometry = get_geometry(source, "klipper", DECIMALS)
-    wanted: dict[Name, float | str] = {("printer", "delta_radius"): geometry.radius}
-    defaults: dict[Name, float] = {}
-    for k, section in enumerate(STEPPERS):
-        wanted[section, "angle"] = geometry.angles[k]
-        defaults[section, "angle"] = NOMINAL_ANGLES[k]
-        for option, values in (("arm_length", geometry.arms), ("position_endstop", geometry.stops)):
-            wanted[section, option] = values[k]
-            if k:  # left out, it is that of tower a
-                defaults[section, option] = values[0]
+    own = {part.format(k) for k in "abc" for part in ROTARY_PARTS} | {"shoulder_radius"}
+    is_rotary = own <= set(source.robot.parameters.names)
+    if is_rotary:
+        wanted = _list_rotary(source)
+    else:
+        geometry = get_geometry(source, "klipper", DECIMALS)
+        wanted = {("printer", "delta_radius"): geometry.radius}
+        for k, section in enumerate(STEPPERS):
+            wanted[section, "angle"] = geometry.angles[k]
+            wanted[section, "arm_length"] = geometry.arms[k]
+            wanted[section, "position_endstop"] = geometry.stops[k]
+    angles = ROTARY_ANGLES if is_rotary else NOMINAL_ANGLES
+    defaults = {(s, "angle"): angle for s, angle in zip(STEPPERS, angles, strict=True)}
+    for section, option in wanted:  # left out, it is that of tower a
+        if section in STEPPERS[1:] and option != "angle":
+            defaults[section, option] = float(wanted[STEPPERS[0], option])
     if into is not None:
-        return read_config(into).export(into, wanted, defaults)
+        kinematics = ("rotary_delta",) if is_rotary else ("delta",)
+        return read_config(into, kinematics).export(into, wanted, defaults)
     if source.is_for_people:
         lines: list[str] = []
         for (section, option), text in shorten_numbers(wanted, DECIMALS).items():

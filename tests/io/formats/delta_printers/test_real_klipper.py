@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import loopcal as lc
+from loopcal.errors import FileError
 from loopcal.io.formats import FORMATS
 from loopcal.io.formats.import_export import build_imported_robot
 from loopcal.io.formats.program_format import ExportSource, ImportOptions
@@ -176,6 +177,90 @@ def test_klipper_calibrates_to_what_loopcal_identifies(klipper, tmp_path, monkey
     own = start.new_calibration(found[0])
     difference = get_positions(own, steps) - predict(fit, steps * STEPS)
     assert np.abs(difference[:, 2]).max() < 1e-3  # [mm], where Klipper's descent ends
+
+
+ROTARY = (
+    "[printer]\nkinematics: rotary_delta\nmax_velocity: 300\nshoulder_radius: 33.9\n"
+    "shoulder_height: 412.9\n[delta_calibrate]\nradius: 50\n[stepper_a]\nposition_endstop: 252\n"
+    "gear_ratio: 107.000:16, 60:16\nupper_arm_length: 170.000\nlower_arm_length: 320.000\n"
+    + PINS.format(0)
+    + "[stepper_b]\ngear_ratio: 107.000:16, 60:16\nangle: 150.2\n"
+    + PINS.format(1)
+    + "[stepper_c]\ngear_ratio: 107.000:16, 60:16\nlower_arm_length: 320.3\n"
+    + PINS.format(2)
+    + SAVED[: SAVED.index("#*# [printer]")]
+    + "#*# [stepper_b]\n#*# position_endstop = 251.7\n"
+)
+ANGLE = 2 * math.pi / (200 * 16 * 107 / 16 * 60 / 16)
+"""Angle of a step of a motor [rad]."""
+
+
+@pytest.mark.slow
+def test_klipper_moves_a_rotary_delta_as_loopcal_states(klipper, tmp_path) -> None:
+    path = tmp_path / "printer.cfg"
+    path.write_text(ROTARY)
+    robot = read(path)[0]
+    steps = np.random.default_rng(1).uniform(2000, 4500, (20, 3))
+    own = Printer(path).load_kinematics("rotary_delta").get_calibration()
+    places = lc.forward(robot, steps * ANGLE).T[:, :3, 3] / MM
+    np.testing.assert_allclose(places, get_positions(own, steps), rtol=0, atol=EXACT)
+    # exported with other values of all parameters, in place and as a block to paste
+    identified = disturb(robot, 2)
+    exported = FORMATS["klipper"].write(ExportSource(identified), path)  # type: ignore[misc]
+    path.write_text(exported.text)
+    assert "angle: 150.2" not in exported.text
+    kinematics = Printer(path).load_kinematics("rotary_delta")
+    positions = get_positions(kinematics.get_calibration(), steps)
+    wanted = lc.forward(identified, steps * ANGLE).T[:, :3, 3] / MM
+    np.testing.assert_allclose(positions, wanted, rtol=0, atol=ROUNDED)
+    again = read(path)[0]
+    points = np.random.default_rng(3).uniform([-50, -50, 0], [50, 50, 60], (20, 3))
+    turns = [[r.calc_position_from_coord(p) for r in kinematics.rails] for p in points.tolist()]
+    readings = lc.inverse(again, points * MM).q
+    stops = kinematics.get_calibration().abs_endstops
+    np.testing.assert_allclose(np.array(stops) - turns, readings, rtol=0, atol=1e-12)
+    block = FORMATS["klipper"].write(ExportSource(identified), None)  # type: ignore[misc]
+    for line in block.text.splitlines()[4:]:
+        if " = " in line:
+            assert line.removeprefix("#*# ").replace(" = ", ": ") in exported.text.replace(
+                " = ", ": "
+            )
+    # a delta's numbers do not fit into it, nor its own into a delta's file
+    (tmp_path / "delta").mkdir()
+    delta, _ = write_delta(tmp_path / "delta")
+    for machine, file in ((identified, delta), (read(delta)[0], path)):
+        with pytest.raises(FileError):
+            FORMATS["klipper"].write(ExportSource(machine), file)  # type: ignore[misc]
+
+
+@pytest.mark.slow
+def test_heights_of_a_rotary_delta_lead_to_its_geometry(klipper, tmp_path) -> None:
+    path = tmp_path / "printer.cfg"
+    path.write_text(ROTARY)
+    robot = read(path)[0]
+    free = robot.parameters.free
+    truth = robot.with_values(np.where(free, disturb(robot, 5).values, robot.values))
+    assert free.sum() == 4  # as in Klipper: the height of the shoulders, and the end stops
+    places = np.random.default_rng(4).uniform([-40, -40, 0], [40, 40, 0.01], (20, 3)) * MM
+    steps = lc.inverse(truth, places).q / ANGLE
+    probed = "#*# [delta_calibrate]\n" + "".join(
+        f"#*# height{i} = {z / MM:.6f}\n#*# height{i}_pos = {','.join(f'{s:.3f}' for s in row)}\n"
+        for i, (row, z) in enumerate(zip(steps.tolist(), places[:, 2].tolist(), strict=True))
+    )
+    path.write_text(ROTARY + probed)
+    robot, measured = read(path)
+    assert measured is not None
+    fit = lc.calibrate(robot, measured).robot
+    np.testing.assert_allclose(fit.values, truth.values, rtol=0, atol=2e-6)  # [m, rad]; 0.001 steps
+
+
+def test_arms_that_do_not_reach_are_refused_with_their_line(tmp_path) -> None:
+    path = tmp_path / "printer.cfg"
+    path.write_text(ROTARY.replace("shoulder_height: 412.9", "shoulder_height: 912.9"))
+    with pytest.raises(FileError) as refused:
+        read(path)
+    assert refused.value.code == "files.arms-out-of-reach"
+    assert refused.value.line is not None
 
 
 def intersect(centers: np.ndarray, lengths: np.ndarray) -> np.ndarray:
