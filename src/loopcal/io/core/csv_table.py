@@ -236,7 +236,14 @@ class Table:
                 if infinite and cells[i] == "inf":
                     values[i] = math.inf
                 elif cells[i] or not empty:
-                    raise self._refuse_cell(name, first + i, cells[i])
+                    sentence = f"column {name!r} is empty, but required. Write its value"
+                    if cells[i] and parse_number(cells[i]) is None:
+                        sentence = f"column {name!r} is {quote(cells[i])}, but must be a number"
+                        sentence += ", such as 12.5 or 1e-3"
+                    elif cells[i]:
+                        sentence = f"column {name!r} is {quote(cells[i])}, which is not finite"
+                        sentence += ". Leave the cell empty if you measured nothing"
+                    raise self.row_error(first + i, sentence)
             parts.append(values)
             first += len(cells)
         return np.concatenate(parts)
@@ -252,16 +259,6 @@ class Table:
             return find_unit(symbol, dimension)
         except UnitError as error:
             raise self.header_error(f"column {name!r}: {error}") from None
-
-    def _refuse_cell(self, name: str, row: int, cell: str) -> FileError:
-        """Return why a cell is not a finite number."""
-        if not cell:
-            return self.row_error(row, f"column {name!r} is empty, but required. Write its value")
-        if parse_number(cell) is None:
-            sentence = f"column {name!r} is {quote(cell)}, but must be a number"
-            return self.row_error(row, f"{sentence}, such as 12.5 or 1e-3")
-        sentence = f"column {name!r} is {quote(cell)}, which is not finite"
-        return self.row_error(row, f"{sentence}. Leave the cell empty if you measured nothing")
 
     def header_error(self, sentence: str) -> FileError:
         """Return an error at the header line."""

@@ -146,13 +146,6 @@ class FolderKind(NamedTuple):
     names: tuple[str, ...]
     filled_in: tuple[str, ...] = ()
 
-    def expects(self, name: str) -> bool:
-        """Return whether a file of this name belongs to the folder."""
-        return name == self.document or any(
-            name.count("/") == pattern.count("/") and fnmatchcase(name, pattern)
-            for pattern in self.names
-        )
-
 
 def refuse_folder(path: Path, kind: FolderKind, force: bool, inputs: Sequence[Path] = ()) -> None:
     """Refuse a folder that cannot or must not be written; a folder set aside gets its name again.
@@ -296,7 +289,11 @@ def _is_expected(path: Path, name: str, kind: FolderKind, listed: Mapping[str, s
     if entry.is_dir():
         return any(pattern.startswith(f"{name}/") for pattern in kind.names)
     is_listed = kind.document not in listed or name in listed
-    return kind.expects(name) and is_listed and entry.is_file()
+    is_known = name == kind.document or any(
+        name.count("/") == pattern.count("/") and fnmatchcase(name, pattern)
+        for pattern in kind.names
+    )
+    return is_known and is_listed and entry.is_file()
 
 
 def _is_changed(path: Path, name: str, kind: FolderKind, listed: Mapping[str, str]) -> bool:

@@ -584,7 +584,7 @@ def read_json(path: str | Path, what: str, action: str, limit: FileLimit = PROGR
     try:
         content = json.loads(
             text,
-            parse_float=_read_float,
+            parse_float=lambda number: _refuse_infinite(float(number), number),
             parse_int=lambda number: _refuse_infinite(
                 int(number) if len(number) <= LONGEST_WHOLE else math.inf, number
             ),
@@ -604,12 +604,6 @@ def read_json(path: str | Path, what: str, action: str, limit: FileLimit = PROGR
         layer = [c for n in layer for c in (n.values() if isinstance(n, dict) else n)]
     JSON_DEPTH.check(depth, what, path)
     return content
-
-
-def _read_float(text: str) -> float:
-    """Return a number that fits a double."""
-    value = float(text)
-    return value if math.isfinite(value) else _refuse_infinite(value, text)
 
 
 def _refuse_infinite(value: float, text: str) -> float:

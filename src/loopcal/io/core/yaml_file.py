@@ -8,7 +8,7 @@ import json
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -90,25 +90,18 @@ def parse_yaml(
     """Parse YAML text that begins at line `first_line` of `path`; raise as `read_yaml`."""
     path = as_path(path, what)
     YAML_SIZE.check(len(text), what, path)
-    is_ours = not has_names or _KNOWN_KEY.search(text) is not None
-    with _hide_content(path, what) if not is_ours else nullcontext():
+    try:
         content, lines = _load_content(text, path, what, first_line, has_names)
+    except FileError as error:
+        is_ours = not has_names or _KNOWN_KEY.search(text) is not None
+        if is_ours or error.code == "files.limit-exceeded":  # which only has numbers
+            raise
+        finding = report_finding("files.not-recognized", what=what)  # shows nothing of the text
+        raise FileError(finding, path, error.line) from None
     if not isinstance(content, dict):
         sentence = f"this {what} contains no 'key: value' lines. See the examples of loopcal"
         raise FileError(sentence, path)
     return YamlFile(path, text, content, lines, first_line)
-
-
-@contextmanager
-def _hide_content(path: Path, what: str) -> Iterator[None]:
-    """Replace the text of a FileError of the body: nothing of a file of somebody else is shown."""
-    try:
-        yield
-    except FileError as error:
-        if error.code == "files.limit-exceeded":
-            raise  # it only has numbers
-        finding = report_finding("files.not-recognized", what=what)
-        raise FileError(finding, path, error.line) from None
 
 
 def _load_content(

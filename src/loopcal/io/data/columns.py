@@ -291,15 +291,6 @@ def _number(name: str, dimension: Dimension) -> Column:
     return NumberColumn(name, dimension, DISPLAY_UNITS[dimension].symbol)
 
 
-def _readings(robot: Mechanism, kinds: Sequence[Kind]) -> Iterable[Column]:
-    del kinds
-    for a in robot.actuators:
-        if is_context(a.name):
-            yield ContextColumn(a.name)
-        else:
-            yield NumberColumn(a.name, a.dimension, robot.units[a.dimension])
-
-
 def _text_rule(meaning: str, column: TextColumn) -> ColumnRule:
     return ColumnRule(column.name, "", meaning, lambda _robot, _kinds: (column,))
 
@@ -325,7 +316,17 @@ RULES: tuple[ColumnRule, ...] = (
     ),
     _text_rule("rows of a session share unknown frames and targets", TextColumn("session")),
     _text_rule("rows of a group share a surface or the constant of a lock", TextColumn("group")),
-    ColumnRule("ACTUATOR", "[mm] or [deg]", "reading of the actuator", _readings),
+    ColumnRule(
+        "ACTUATOR",
+        "[mm] or [deg]",
+        "reading of the actuator",
+        lambda robot, _: [
+            ContextColumn(a.name)
+            if is_context(a.name)
+            else NumberColumn(a.name, a.dimension, robot.units[a.dimension])
+            for a in robot.actuators
+        ],
+    ),
     ColumnRule(
         "force.AXIS, moment.AXIS, load.ACTUATOR",
         "[N], [Nm]",

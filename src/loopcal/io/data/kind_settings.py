@@ -216,14 +216,15 @@ def read_noise(
         example = ", ".join(f"{name}: {EXAMPLES[d]}" for name, d in dimensions.items())
         sentence = "'noise' must give a standard deviation for each column"
         raise file.error(f"{sentence}. Write 'noise: {{{example}}}'", place)
-    return {
-        column: _read_size(
-            file, text, {**dimensions, **sight}[column], at, f"the noise of {at[-1]!r}"
-        )
-        for text, names, at in match_names(file, stated, [*dimensions, *sight], place)
-        for column in names
-        if column in dimensions or column == at[-1]  # a pattern is of columns
-    }
+    noise: dict[str, StatedSd] = {}
+    for text, names, at in match_names(file, stated, [*dimensions, *sight], place):
+        uncertainty = text if isinstance(text, dict) else {"sd": text}
+        record = read_record(file, uncertainty, Uncertainty, None, at)
+        for column in names:
+            if column in dimensions or column == at[-1]:  # a pattern is of columns
+                dimension, what = {**dimensions, **sight}[column], f"the noise of {at[-1]!r}"
+                noise[column] = record.read(file, dimension, at, what)
+    return noise
 
 
 def match_names(
@@ -236,14 +237,6 @@ def match_names(
         if not matching:
             refuse_unknown_keys(file, [pattern], names, place)
         yield node, matching, (*place, pattern)
-
-
-def _read_size(
-    file: YamlFile, node: Any, dimension: Dimension, place: Location, what: str
-) -> StatedSd:
-    """Return a standard deviation [SI] with its statement: a text `8 um`, or an uncertainty."""
-    stated = node if isinstance(node, dict) else {"sd": node}
-    return read_record(file, stated, Uncertainty, None, place).read(file, dimension, place, what)
 
 
 def _state_size(text: Any, distribution: str = "normal", divisor: float = 1.0) -> StatedSize:

@@ -181,18 +181,6 @@ def check_count(line: Line, delimiter: str | None) -> None:
     raise Misfit(f"it has {_count_cells(count)}, but the header has {wanted} columns ({reason})")
 
 
-def find_unusual_lines(lines: Sequence[Line]) -> dict[int, str]:
-    """Return number -> reason of lines without a header that have another length than most."""
-    placed = [line for line in lines if line.header is None]
-    counts = Counter(len(line.cells) for line in placed)
-    most = max(counts, key=lambda count: (counts[count], -count), default=0)
-    return {
-        line.number: f"it has {_count_cells(count)}, but most lines have {most}"
-        for line in placed
-        if (count := _count(line.cells, most)) != most
-    }
-
-
 def _count(cells: Sequence[str], wanted: int) -> int:
     """Return the number of cells; one separator behind the wanted cells is not a cell."""
     return len(cells) - (len(cells) > wanted and not cells[-1])
@@ -243,14 +231,19 @@ def _join_rows(
     misfits: list[tuple[int, str]] = []
     readings: dict[str, Row] = {}
     other_times = 0
-    unusual = find_unusual_lines([line for line, _ in lines])
+    placed = [line for line, _ in lines if line.header is None]
+    counts = Counter(len(line.cells) for line in placed)
+    most = max(counts, key=lambda count: (counts[count], -count), default=0)
     for line, row in lines:
         try:
-            if line.number in unusual:
-                raise Misfit(unusual[line.number])
+            if line.header is None and (count := _count(line.cells, most)) != most:
+                raise Misfit(f"it has {_count_cells(count)}, but most lines have {most}")
             shared, values = _split_row(row, profile)
-            if values:
-                _check_readings(shared, readings.get(row["pose"], {}), profile)
+            known = readings.get(row["pose"], {}) if values else {}
+            for name, before in known.items():
+                if shared[name] and not _is_equal(shared[name], before):
+                    sentence = f"{name!r} is {shared[name]} here, but {before} in an earlier line"
+                    raise Misfit(f"{sentence} of the pose {row['pose']!r}")
         except Misfit as error:
             misfits.append((line.number, str(error)))
             continue
@@ -286,15 +279,6 @@ def _split_row(row: Row, profile: Profile) -> tuple[Row, Row]:
         return shared, {}
     names = [name for name in shared if _belongs_to_target(name, profile)]
     return shared, {_add_target(name, target): shared.pop(name) for name in names}
-
-
-def _check_readings(row: Row, known: Row, profile: Profile) -> None:
-    """Raise Misfit for a reading that differs from an earlier line of this pose."""
-    for name in profile.record.readings:
-        cell, before = row[name], known.get(name, "")
-        if cell and before and not _is_equal(cell, before):
-            sentence = f"{name!r} is {cell} here, but {before} in an earlier line of the pose"
-            raise Misfit(f"{sentence} {row['pose']!r}")
 
 
 def list_headers(profile: Profile) -> dict[str, str | None]:

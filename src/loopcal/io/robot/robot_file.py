@@ -105,19 +105,6 @@ def read_identified_values(file: YamlFile, robot: Mechanism) -> FloatArray:
     return values
 
 
-def refuse_impossible_values(file: YamlFile, robot: Mechanism, values: FloatArray) -> None:
-    """Refuse values of the file's table that no machine has. A file of a calibration that failed
-    keeps such values, to be looked at.
-    """
-    if file.text.startswith(NOT_CALIBRATED):
-        return
-    for name, finding in find_impossible_values(robot, values)[:1]:
-        rows = [row.get("name") for row in file.content[TABLE]]
-        place: Location = (TABLE, rows.index(name)) if name in rows else (TABLE,)
-        advice = "Correct the value, or delete this table to restore the nominal robot"
-        raise file.error(f"{finding}. {advice}", place)
-
-
 def read_rows(file: YamlFile, robot: Mechanism) -> dict[str, float]:
     """Return the values [SI] of the file's table by name; raise as `read_identified_values`."""
     rows = file.content[TABLE]
@@ -226,7 +213,13 @@ def build_robot(file: YamlFile) -> Mechanism:
     if TABLE not in file.content:
         return robot
     values = read_identified_values(file, robot)
-    refuse_impossible_values(file, robot, values)
+    # a file of a calibration that failed keeps values that no machine has, to be looked at
+    is_calibrated = not file.text.startswith(NOT_CALIBRATED)
+    for name, finding in find_impossible_values(robot, values) if is_calibrated else ():
+        rows = [row.get("name") for row in file.content[TABLE]]
+        place: Location = (TABLE, rows.index(name)) if name in rows else (TABLE,)
+        advice = "Correct the value, or delete this table to restore the nominal robot"
+        raise file.error(f"{finding}. {advice}", place)
     return robot.with_values(values)
 
 

@@ -457,8 +457,11 @@ def _has_form(array: np.ndarray, form: str, sizes: dict[str, int]) -> bool:
     word, *axes = form.split()
     if array.ndim != len(axes) or array.dtype.kind != TYPES[word]:
         return False
-    if word == "text" and not _is_text(array):
-        return False
+    if word == "text" and array.dtype.itemsize and array.size:
+        # characters that UTF-8 can hold; NumPy stores any four bytes
+        codes = np.ascontiguousarray(array).view(np.uint32)
+        if not np.all((codes < 0xD800) | ((codes > 0xDFFF) & (codes < 0x110000))):
+            return False
     if array.dtype.kind == "f" and array.dtype != float:
         return False
     if word == "finite" and not np.isfinite(array).all():
@@ -470,14 +473,6 @@ def _has_form(array: np.ndarray, form: str, sizes: dict[str, int]) -> bool:
         if size != factor * (sizes.setdefault(match[2], size // factor) if match[2] else 1):
             return False
     return True
-
-
-def _is_text(array: np.ndarray) -> bool:
-    """Return whether all characters are some that UTF-8 can hold; NumPy stores any four bytes."""
-    if array.dtype.itemsize == 0 or array.size == 0:
-        return True
-    codes = np.ascontiguousarray(array).view(np.uint32)
-    return bool(np.all((codes < 0xD800) | ((codes > 0xDFFF) & (codes < 0x110000))))
 
 
 # Run folders: written, and read back.

@@ -162,8 +162,13 @@ def read_mechanism(tree: LinkTree, path: Path | None) -> Linkage:
         graph, left = couple_joints(graph, couplings)
     except MechanismError as error:
         raise _locate_error(error, tree, closures) from None
-    rigid = _list_rigid_closures(tree, closures)
-    return Linkage(tree, graph, bodies, ends, left, rigid)
+    rigid = []
+    # a pin is a closure of type 6d only where a revolute joint carries one of its frames
+    for pair, kind in zip(closures.pairs, closures.kinds, strict=True):
+        joints_at = [tree.carrier.get(_find_link(tree, name) or "") for name in pair]
+        if kind == WELD and not any(joint is not None and joint.kind for joint in joints_at):
+            rigid.append(f"{pair[0]}, {pair[1]}")
+    return Linkage(tree, graph, bodies, ends, left, tuple(rigid))
 
 
 def _read_closures(path: Path, tree: LinkTree) -> Closures:
@@ -333,20 +338,6 @@ def _build_closure(
     if kind == PIN:
         return GraphJoint(name, "R", a, b, T_a, T_b, z, near, far, "xy")
     return GraphJoint(name, "S", a, b, T_a, T_b, z, near, far)
-
-
-def _list_rigid_closures(tree: LinkTree, closures: Closures) -> tuple[str, ...]:
-    """Return the closures of type 6d both frames of which are fixed to their links.
-
-    A pin is a closure of type 6d only where a revolute joint carries one of its frames.
-    """
-    rigid = []
-    for pair, kind in zip(closures.pairs, closures.kinds, strict=True):
-        links = (_find_link(tree, name) for name in pair)
-        carriers = [tree.carrier.get(link) for link in links if link is not None]
-        if kind == WELD and not any(joint is not None and joint.kind for joint in carriers):
-            rigid.append(f"{pair[0]}, {pair[1]}")
-    return tuple(rigid)
 
 
 def _build_constraint(tree: LinkTree, constraint: Constraint) -> tuple[Weld | GraphJoint, ...]:

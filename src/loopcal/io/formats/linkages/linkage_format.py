@@ -263,7 +263,11 @@ def read(tree: LinkTree, options: ImportOptions, what: str) -> Imported:
             )
             raise MechanismError(finding)
     except MechanismError as error:
-        finding = _name_links(mechanism, error.args[0])
+        # the refusal names links of the file instead of the bodies that they form
+        bodies = {"body", "body_a", "body_b", "platform"}
+        data = error.args[0].data.items()
+        named = {k: choose_link(mechanism, v) if k in bodies else v for k, v in data}
+        finding = replace(error.args[0], data=named)
         _check_couplings(mechanism, finding.data.get("joints", ()))
         raise tree.error(finding, _find_origin(tree, finding.data.get("joints", ()))) from None
     moving = [name for j in paths.graph.joints for name in (j.name, j.origin_a, j.origin_b)]
@@ -341,16 +345,6 @@ def _find_origin(tree: LinkTree, names: Sequence[str]) -> str:
             if joint in tree.places:
                 return joint
     return ""
-
-
-def _name_links(mechanism: Linkage, finding: Finding) -> Finding:
-    """Return a refusal that names the links of the file instead of the bodies that they form."""
-    bodies = {"body", "body_a", "body_b", "platform"}
-    data = {
-        key: choose_link(mechanism, value) if key in bodies else value
-        for key, value in finding.data.items()
-    }
-    return replace(finding, data=data)
 
 
 def _check_couplings(mechanism: Linkage, names: Collection[str]) -> None:

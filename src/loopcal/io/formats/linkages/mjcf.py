@@ -274,8 +274,7 @@ def read_tree(path: Path) -> LinkTree:
         raise FileError(f"the root is <{root.name}>, not <mujoco>. Check the file", path)
     reader = _Reader(_include(root, path))
     reader.read_all()
-    top = _choose_root(reader)
-    links = _list_carried(reader, top)
+    links = _list_carried(reader)
     joints = [joint for joint in reader.joints if joint.parent in links and joint.child in links]
     constraints = [closure.constraint for closure in _read_closures(reader, links)]
     joints, notes = _couple(reader, joints)
@@ -285,30 +284,24 @@ def read_tree(path: Path) -> LinkTree:
     return replace(tree, hidden=hidden, notes=(*notes, *driven_notes))
 
 
-def _choose_root(reader: _Reader) -> str:
-    """Return the base: the world, or the only free body, if nothing else moves."""
-    moving = {joint.parent for joint in reader.joints if joint.kind}
+def _list_carried(reader: _Reader) -> dict[str, None]:
+    """Return the links of the mechanism, from its base on: the world, or the only free body if
+    nothing else moves. Other free bodies are left out.
+    """
     free = reader.floating
-    on_world = any(_find_top(reader, body) not in free for body in moving if body in reader.bodies)
-    return free[0] if len(free) == 1 and not on_world else WORLD
 
+    def find_top(body: str) -> str:
+        while reader.carriers.get(body, WORLD) != WORLD:
+            body = reader.carriers[body]
+        return body
 
-def _find_top(reader: _Reader, body: str) -> str:
-    """Return the body of the world that carries a body."""
-    while reader.carriers.get(body, WORLD) != WORLD:
-        body = reader.carriers[body]
-    return body
-
-
-def _list_carried(reader: _Reader, top: str) -> dict[str, None]:
-    """Return the links that a body carries, itself first; free bodies are left out."""
-    links = {top: None}
-    joints = [j for j in reader.joints if j.child not in reader.floating]
-    while True:
-        more = {j.child: None for j in joints if j.parent in links and j.child not in links}
-        if not more:
-            return links
+    moving = {joint.parent for joint in reader.joints if joint.kind} & reader.bodies.keys()
+    on_world = any(find_top(body) not in free for body in moving)
+    links = {free[0] if len(free) == 1 and not on_world else WORLD: None}
+    joints = [j for j in reader.joints if j.child not in free]
+    while more := {j.child: None for j in joints if j.parent in links and j.child not in links}:
         links |= more
+    return links
 
 
 @dataclass(frozen=True, eq=False)

@@ -28,6 +28,8 @@ from loopcal.typing import FloatArray
 ROUNDED = 4
 """Decimals from which a number counts as rounded, such as 1.5708 for a right angle."""
 
+START_TAG = re.compile(rb"""<(?:[^>"']|"[^"]*"|'[^']*')*>""")
+
 Edit = tuple[int, int, str]
 """First byte and end of a part of a text, and what replaces it."""
 
@@ -137,7 +139,9 @@ def parse_xml(text: str, path: Path, what: str) -> Element:
 
     def start(name: str, attributes: dict[str, str]) -> None:
         line, first = parser.CurrentLineNumber, parser.CurrentByteIndex
-        end = _find_tag_end(raw, first)
+        # the start tag ends at the first > outside of quotes
+        tag = START_TAG.match(raw, first)
+        end = raw.index(b">", first) + 1 if tag is None else tag.end()
         element = Element(name, attributes, path, line, first, end, end)
         found.append(element)
         if len(found) > XML_ELEMENTS.count:
@@ -169,12 +173,6 @@ def parse_xml(text: str, path: Path, what: str) -> Element:
         sentence = f"not valid XML ({expat.ErrorString(error.code)}). Correct it"
         raise FileError(sentence, path, error.lineno) from None
     return found[0]
-
-
-def _find_tag_end(raw: bytes, start: int) -> int:
-    """Return the byte after a start tag: after the first > outside of quotes."""
-    match = re.compile(rb"""<(?:[^>"']|"[^"]*"|'[^']*')*>""").match(raw, start)
-    return match.end() if match is not None else raw.index(b">", start) + 1
 
 
 # Links and joints as a tree.
