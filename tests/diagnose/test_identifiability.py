@@ -151,7 +151,7 @@ def test_observability_indices_equal_their_definitions():
     cut = compute_observability(np.append(s, 1e-17), 5, 30)
     assert (cut.o3, cut.left_out) == (result.o3, 1)
     assert compute_observability(np.zeros(3), 0, 4).o1 == 0.0
-    assert "rows divided by sigma, columns multiplied by tolerance" in str(result)
+    assert "rows divided by sigma, columns multiplied by prior sd" in str(result)
 
 
 def test_combinations_span_the_null_space():

@@ -84,7 +84,7 @@ SOURCE_WORDS = {
     "residuals.shared-errors": "shared errors",
     "residuals.depend-on-temperature": "temperature",
     "residuals.depend-on-reading": "dependence on a reading",
-    INFLATION: "factor on the tolerances",
+    INFLATION: "factor on the expected spreads",
     "noise.setup-as-stated": "setup parameters and common errors",
 }
 

@@ -72,7 +72,7 @@ if TYPE_CHECKING:
 
 
 # Units of the singular values; every index depends on them.
-SCALING = "rows divided by sigma, columns multiplied by tolerance"
+SCALING = "rows divided by sigma, columns multiplied by prior sd"
 
 MEANING = {
     "o1": "(product of s)^(1/L) / sqrt(m): a small uncertainty ellipsoid",
@@ -195,7 +195,7 @@ class Identifiability(DrawnResult):
         *fields("findings", scaling=lambda _: SCALING),
         Field("determined", "parameters.state", "parameter"),
         Field("sd_over_tolerance", "parameters.left", "parameter", "1"),
-        Field("singular_value", "singular_values", "direction", "sigma per tolerance"),
+        Field("singular_value", "singular_values", "direction", "sigma per prior sd"),
     )
     LABELS: ClassVar[Mapping[str, Any]] = label_axes(parameter="free_parameters.names")
 
@@ -254,7 +254,7 @@ class Identifiability(DrawnResult):
         lines = [str(finding) for finding in self.findings]
         shown = sorted(self.parameters, key=lambda p: (not p.partners, -round(p.left, 6)))
         width = max(len(p.name) for p in shown[:MOST_ROWS])
-        lines += ["", f"{'parameter':<{width}}  sd / tolerance  determined"]
+        lines += ["", f"{'parameter':<{width}}  sd / prior sd   determined"]
         for p in shown[:MOST_ROWS]:
             state = {"determined": "yes", "not at all": "no"}.get(p.state, "only in combination")
             lines.append(f"{p.name:<{width}}  {p.left:>14.2f}  {state}")

@@ -309,7 +309,7 @@ class Ridge(Method):
     """
 
     name: ClassVar[str] = "ridge"
-    what: ClassVar[str] = "least squares with a penalty on deviations in tolerances"
+    what: ClassVar[str] = "least squares with a penalty on deviations in prior sd"
     lam: float | tuple[float, ...] | Mapping[str, float] | Rule = GCV()
 
     def __post_init__(self) -> None:
@@ -436,7 +436,7 @@ class MAP(Method):
     """
 
     name: ClassVar[str] = "map"
-    what: ClassVar[str] = "the tolerances are a prior"
+    what: ClassVar[str] = "the expected spreads are a prior"
     has_prior: ClassVar[bool] = True
     is_biased: ClassVar[bool] = False
     inflation: float | Rule = 1.0

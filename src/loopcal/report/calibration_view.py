@@ -536,7 +536,7 @@ def view_identifiability(report: IdentifiabilityReport, verbose: bool = False) -
             others = f"only with {list_names(row.others, MOST_COMBINATIONS // 2)}"
             rows.append((row.name, states.get(row.state) or others, f"{row.left:.2f}"))
         determined = word_column("determined", wraps=True)
-        columns = ("name", determined, Column("sd / tolerance"))
+        columns = ("name", determined, Column("sd / prior sd"))
         blocks += [make_table("Parameters", columns, rows), say("parameters.sd")]
     if verbose:
         values = [(n, meaning, format_number(x, 3)) for n, x, meaning in analysis.indices.rows()]

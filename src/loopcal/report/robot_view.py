@@ -137,7 +137,7 @@ def _build_parameter_table(robot: Mechanism) -> Table:
         tolerance = math.nan if entry.tolerance is None else entry.tolerance
         numbers.append(format_in(unit, tolerance, 3))
         rows.append((entry.name, *numbers, str(unit), "free" if entry.free else "fixed"))
-    titles = map(Column, ("nominal", "value", "tolerance (1 sd)"))
+    titles = map(Column, ("nominal", "value", "expected spread (1 sd)"))
     return make_table("Parameters", ("name", *titles, "unit", ""), rows)
 
 
@@ -148,7 +148,7 @@ def _build_common_error_table(robot: Mechanism) -> Table:
         unit = units[table.entries[table.index(error.parameters[0])].dimension]
         names = " ".join(error.parameters)
         rows.append((error.name, format_in(unit, error.tolerance, 3), str(unit), names))
-    columns = ("name", Column("tolerance (1 sd)"), "unit", "parameters")
+    columns = ("name", Column("expected spread (1 sd)"), "unit", "parameters")
     return make_table("Common errors", columns, rows)
 
 

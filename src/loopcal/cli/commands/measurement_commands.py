@@ -151,7 +151,7 @@ def simulate(
     distribution: str = opt.DISTRIBUTION,
     sigma_reading: str | None = opt.SIGMA_READING,
     draw_errors: bool = opt.flag(
-        "Draw the errors of the true machine from the tolerances of the robot file."
+        "Draw the errors of the true machine from the expected spreads of the robot file."
     ),
     skip_unreachable: bool = opt.flag("Leave out poses that the machine does not reach."),
     truth: Path | None = opt.path("Also write the true machine, as a robot file."),

@@ -461,7 +461,7 @@ METHODS = {
     "before": "not calibrated",
     "alone": "leg by leg, unweighted (the paper)",
     "together": "all legs, weighted by the noise",
-    "prior": "the same with tolerances as prior (MAP)",
+    "prior": "together, with expected spreads as prior (MAP)",
 }
 RUNS = ("without noise", "without noise, one matrix throughout")
 """Titles of the runs without noise, of which the second keeps the matrix of step 5."""

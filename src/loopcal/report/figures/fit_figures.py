@@ -307,7 +307,7 @@ def draw_parameter_rows(
     handles = [
         make_handle("shift, 95 % interval", color=SHIFT, marker="o", ms=DOT, lw=1.2),
         make_handle("uncertainty (95 %)", color=WIDTH, marker="s", ms=DOT, ls="none"),
-        make_handle("one tolerance", color=PALE, lw=6, alpha=0.5),
+        make_handle("one prior sd", color=PALE, lw=6, alpha=0.5),
     ]
     if not np.isfinite(half).all():
         cross: dict[str, Any] = {"color": SHIFT, "marker": "x", "ms": DOT + 1, "ls": "none"}
@@ -315,7 +315,7 @@ def draw_parameter_rows(
     add_legend(figure, handles)
     status = "" if converged else ", without convergence: last values, not estimates"
     n_assumed = sum(row["tolerance_assumed"] for row in rows)
-    assumed = f", {n_assumed} tolerances assumed" if n_assumed else ""
+    assumed = f", {n_assumed} prior sd assumed" if n_assumed else ""
     return finish_figure(figure, f"{robot}: {name_count(p, 'parameter')}{assumed}{status}")
 
 
@@ -329,7 +329,7 @@ def _draw_shifts(axes: Axes, rows: Sequence[Mapping[str, Any]], half: FloatArray
     axes.errorbar(shift[known], y[known], xerr=half[known], color=SHIFT, **style)
     axes.plot(shift[~known], y[~known], "x", color=SHIFT, ms=DOT + 1)
     label_rows(axes, [shorten(row["name"]) for row in rows])
-    label_axes(axes, "estimate - nominal [tolerance]", "", "shift")
+    label_axes(axes, "estimate - nominal [prior sd]", "", "shift")
 
 
 def _draw_uncertainties(
@@ -352,7 +352,7 @@ def _draw_uncertainties(
         numbers.append(f"{shown if converged else f'{value:.3g}'}{unit}")
     axes.yaxis.tick_right()
     label_rows(axes, numbers)
-    label = "half-width [tolerance]" if drawn.any() else ""
+    label = "half-width [prior sd]" if drawn.any() else ""
     title = "uncertainty (95 %)" if drawn.any() else "without an interval"
     label_axes(axes, label, "", title)
 
@@ -439,7 +439,7 @@ def draw_convergence(fit: Identification) -> Figure:
         axes.set_xlim(-0.3, max(count - 1, 1) + 0.3)
         label_sparsely(axes.xaxis)
     label_axes(of_cost, "step [1]", "sum of (residual/sigma)² [1]", "sum of squares")
-    distances = "distance from the last value [tolerance]"
+    distances = "distance from the last value [prior sd]"
     label_axes(of_parameters, "step [1]", distances, "parameters")
     words = fit.status.name.lower().replace("_", " ")
     return finish_figure(figure, f"{fit.robot.name}: {words} after {fit.history.iterations} steps")
@@ -489,7 +489,7 @@ def _draw_spectrum(axes: Axes, analysis: Identifiability) -> None:
     if rank < count:
         style: dict[str, Any] = {"color": COLORS[1], "mfc": "none", "ms": DOT + 1.5}
         axes.plot(number[rank:], drawn[rank:], "v", label="counts as zero", **style)
-    axes.axhline(1.0, **DASHED, label="known as well as the tolerance")
+    axes.axhline(1.0, **DASHED, label="known as well as the prior sd")
     if rank < count:
         limit = max(analysis.tolerance * float(s[0]), floor)
         axes.axhline(limit, color=DARK, lw=THIN, ls=":", label="limit of the rank")
@@ -507,7 +507,7 @@ def _draw_spectrum(axes: Axes, analysis: Identifiability) -> None:
         )  # fmt: skip
     axes.set_xlim(0.4 - 0.02 * count, count + 0.6 + 0.02 * count)
     label_sparsely(axes.xaxis, min_n_ticks=1)
-    label_axes(axes, "direction [1]", "singular value [sigma per tolerance]", "singular values")
+    label_axes(axes, "direction [1]", "singular value [sigma per prior sd]", "singular values")
 
 
 def _draw_combinations(
@@ -536,9 +536,7 @@ def _draw_combinations(
     label_axes(axes, "", "", f"null vectors and weak directions{more}", grid=False)
     if len(names) > len(named):
         axes.set_xlabel(f"and {len(names) - len(named)} more parameters", fontsize=SMALL)
-    add_colorbar(
-        figure, image, axes, "weight in tolerances, largest = 1 [1]", aspect=25, shrink=0.8
-    )
+    add_colorbar(figure, image, axes, "weight in prior sd, largest = 1 [1]", aspect=25, shrink=0.8)
 
 
 METHOD_MARKERS = {
@@ -573,7 +571,7 @@ def draw_regularization(curves: RegularizationCurves) -> Figure:
         axes.axhline(1.0, color="0.5", lw=0.8, ls="--", label="noise alone")
         method, number = WORDS[curve.name]
         axes.set_title(method, fontsize=10)
-        lam = "lam [(sigma per tolerance)²]"
+        lam = "lam [(sigma per prior sd)²]"
         axes.set_xlabel(lam if curve.name == "lam" else f"directions {number} [1]")
         axes.grid(visible=True, lw=GRID)
         axes.legend(frameon=False, fontsize=SMALL)
