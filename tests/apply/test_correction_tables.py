@@ -44,7 +44,7 @@ def interpolate(table: CorrectionTable, name: str, points: np.ndarray) -> np.nda
 def test_a_grid_leaves_at_other_points_what_it_states(name, limit) -> None:
     robot = lc.load_robot(name)
     truth = disturb(robot)
-    (table,), (found,) = make_tables(truth, robot, GRID, limit)
+    (table,), found = make_tables(truth, robot, GRID, limit)
     points = lc.sample_workspace(robot, 500, 7).coordinates
     commands = points + np.column_stack(
         [interpolate(table, coordinate, points) for coordinate in robot.controlled]
@@ -77,9 +77,10 @@ def test_a_table_that_is_too_small_says_so() -> None:
     small = TableSize("height", 30, 8)
     (table,), found = make_tables(disturb(robot), robot, small, 1e-6)
     assert table.values["z"].size <= 30
-    assert not found[0].data["is_met"]
-    assert found[0].data["after"].value > 1e-3
-    assert found[1].code == "files.table-leaves"
+    assert not found.data["is_met"]
+    assert found.data["after"].value > 1e-3
+    assert found.data["others"] == ("x", "y")
+    assert found.data["rest"].value > 0.1
 
 
 def test_periodic_errors_of_screws_are_corrected_by_tables_of_readings(tmp_path) -> None:
@@ -91,18 +92,18 @@ def test_periodic_errors_of_screws_are_corrected_by_tables_of_readings(tmp_path)
     robot = load_text(tmp_path, text)
     own = [".gain" in n or "1" in n.rpartition(".")[2] for n in robot.parameters.names]
     truth = robot.with_values(np.where(own, disturb(robot).values, robot.values))
-    tables, (found,) = make_tables(truth, robot, READINGS, 2e-6)
+    tables, found = make_tables(truth, robot, READINGS, 2e-6)
     assert found.data["is_met"]
     assert found.data["before"].value > 0.02  # [mm]
     assert [len(t.axes) for t in tables] == [1] * 6
     # joint centers in addition: no table of a reading corrects them, which is stated
-    found = make_tables(disturb(robot), robot, READINGS, 2e-6)[1][0]
+    found = make_tables(disturb(robot), robot, READINGS, 2e-6)[1]
     assert not found.data["is_met"]
 
 
 def test_machines_without_tables_are_refused() -> None:
     delta, tripod = lc.load_robot("linear-delta"), lc.load_robot("3-prs")
-    codes = []
+    reasons = []
     for robot, controller, size in (
         (disturb(tripod), tripod, GRID),
         (disturb(lc.load_robot("five-bar")), lc.load_robot("five-bar"), HEIGHT),
@@ -111,11 +112,9 @@ def test_machines_without_tables_are_refused() -> None:
     ):
         with pytest.raises(DataError) as refused:
             make_tables(robot, controller, size)
-        codes.append(refused.value.code)
-    assert codes == [
-        "files.no-table", "files.no-table", "files.nothing-to-correct",
-        "files.controller-of-another",
-    ]  # fmt: skip
+        assert refused.value.finding is not None
+        reasons.append(refused.value.finding.data["reason"])
+    assert reasons == ["tilt", "height", "equal", "other"]
 
 
 def test_a_corner_out_of_reach_is_named_with_its_place(tmp_path) -> None:
@@ -124,4 +123,5 @@ def test_a_corner_out_of_reach_is_named_with_its_place(tmp_path) -> None:
     robot = load_text(tmp_path, wide)
     with pytest.raises(DataError) as refused:
         make_tables(disturb(robot), robot, GRID)
-    assert refused.value.code == "files.node-out-of-reach"
+    assert refused.value.finding is not None
+    assert refused.value.finding.data["reason"] == "reach"

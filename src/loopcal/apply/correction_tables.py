@@ -39,7 +39,6 @@ CHECKS = 2000  # points between nodes at which the rest is found
 FEWEST = 3  # nodes along an axis: with the ends alone, a symmetric error looks like none
 ENOUGH = 1.2  # times the least rest of any number of nodes, at which more nodes do not help
 LIGHT = 1e-3  # weight of a coarser table at a node, of a pose near it
-ROUNDING = 1e-9  # errors below this share of the robot's size are rounding
 
 
 class TableSize(NamedTuple):
@@ -101,7 +100,7 @@ class _Machine(NamedTuple):
 
 def make_tables(
     robot: Mechanism, controller: Mechanism, size: TableSize, limit: float | None = None
-) -> tuple[tuple[CorrectionTable, ...], tuple[Finding, ...]]:
+) -> tuple[tuple[CorrectionTable, ...], Finding]:
     """Return the tables with which a controller leads the identified robot to its commands: one,
     or one for each actuator; and what remains between the nodes.
 
@@ -110,13 +109,17 @@ def make_tables(
 
     DataError : the controller errs nowhere, or a node is out of reach.
     """
-    names = robot.controlled
-    if set(names) & set(TILT) or (size.what == "height" and not {"x", "y", "z"} <= set(names)):
-        raise DataError(
-            report_finding("files.no-table", robot=robot.name, names=names, needed=size.what)
-        )
-    if controller.controlled != names or len(controller.actuators) != len(robot.actuators):
-        raise DataError(report_finding("files.controller-of-another", robot=controller.name))
+    names, reason = robot.controlled, ""
+    if set(names) & set(TILT):
+        reason = "tilt"
+    elif size.what == "height" and not {"x", "y", "z"} <= set(names):
+        reason = "height"
+    elif controller.controlled != names or len(controller.actuators) != len(robot.actuators):
+        reason = "other"
+    elif np.array_equal(controller.values, robot.values):
+        reason = "equal"
+    if reason:
+        raise DataError(_refuse(robot, reason))
     ranges = workspace_ranges(robot)
     moved = ["z"] if size.what == "height" else names
     machine = _Machine(robot, controller, [names.index(name) for name in moved])
@@ -136,10 +139,7 @@ def make_tables(
         targets = place(draw_coordinates(np.random.default_rng(0), tuple(axes), ranges, CHECKS))
     before = machine.lead(targets, targets)
     targets, before = (rows[np.isfinite(before).all(axis=1)] for rows in (targets, before))
-    largest = machine.weigh(before)
-    if largest < ROUNDING * robot.size:
-        raise DataError(report_finding("files.nothing-to-correct", robot=robot.name))
-    limit = SHARE * largest if limit is None else limit
+    limit = SHARE * machine.weigh(before) if limit is None else limit
     if size.what == "readings":
         tables, after = _fit_readings(machine, targets, limit, size.most_along)
     else:
@@ -147,7 +147,12 @@ def make_tables(
         nodes, grid, after = _choose_grid(machine, place, targets[:, places], spans, limit, size)
         values = dict(zip(moved, np.moveaxis(grid, -1, 0), strict=True))
         tables = [CorrectionTable(dict(zip(axes, nodes, strict=True)), values)]
-    return tuple(tables), tuple(_report(machine, size, tables, (before, after), limit))
+    return tuple(tables), _report(machine, size, tables, (before, after), limit)
+
+
+def _refuse(robot: Mechanism, reason: str, point: str = "") -> Finding:
+    """Return why there is no table of a robot."""
+    return report_finding("files.no-table", robot=robot.name, reason=reason, point=point)
 
 
 def _report(
@@ -156,7 +161,7 @@ def _report(
     tables: Sequence[CorrectionTable],
     misses: Sequence[FloatArray],
     limit: float,
-) -> list[Finding]:
+) -> Finding:
     """Return how large errors were, what remains, and what no table of this sort corrects."""
     robot, others = machine.robot, tuple(set(range(misses[0].shape[1])) - {*machine.corrected})
     is_met = machine.weigh(misses[1]) <= limit
@@ -167,13 +172,10 @@ def _report(
     for key, (position, angle) in zip(("before", "after", "limit"), sizes, strict=True):
         data[key] = robot.to_quantity(position, Dimension.LENGTH)
         data[f"angle_{key}"] = robot.to_quantity(angle, Dimension.ANGLE) if angle else 0
-    level = Severity.INFO if is_met else Severity.WARNING
-    found = [report_finding("files.table-remains", level, **data)]
-    if others:
-        rest = robot.to_quantity(machine.measure(misses[1], others)[0], Dimension.LENGTH)
-        names = tuple(robot.controlled[i] for i in others)
-        found.append(report_finding("files.table-leaves", names=names, rest=rest))
-    return found
+    data["others"] = tuple(robot.controlled[i] for i in others)
+    data["rest"] = robot.to_quantity(machine.measure(misses[1], others)[0], Dimension.LENGTH)
+    level = Severity.INFO if is_met and not others else Severity.WARNING
+    return report_finding("files.table-remains", level, **data)
 
 
 def _choose_grid(
@@ -205,7 +207,7 @@ def _choose_grid(
         if len(lost):
             pairs = zip(machine.robot.controlled, targets[lost[0]].tolist(), strict=True)
             found = [f"{n} {machine.robot.to_quantity(v, get_dimension(n))}" for n, v in pairs]
-            raise DataError(report_finding("files.node-out-of-reach", point=", ".join(found)))
+            raise DataError(_refuse(machine.robot, "reach", ", ".join(found)))
         grid = (commands - targets)[:, columns].reshape(*counts, len(columns))
         correct = RegularGridInterpolator(nodes, grid)
 

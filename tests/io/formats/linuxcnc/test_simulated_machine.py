@@ -261,7 +261,7 @@ def test_compensation_files_of_the_joints_correct_the_screws(
     truth, table = calibrated.identified, calibrated.identified.parameters
     is_gain = np.array([name.endswith(".gain") for name in table.names])
     controller = truth.with_values(np.where(is_gain, table.nominal, truth.values))
-    tables, (found,) = make_tables(truth, controller, TableSize("readings", 256, 256), 1e-6)
+    tables, found = make_tables(truth, controller, TableSize("readings", 256, 256), 1e-6)
     assert found.data["is_met"]
     files = write_compensation(ExportSource(truth, tables=tables), None).beside
     component.write_text(write(ExportSource(controller, {}, {}), None).text, "utf-8")
