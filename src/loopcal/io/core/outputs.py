@@ -161,7 +161,17 @@ def refuse_folder(path: Path, kind: FolderKind, force: bool, inputs: Sequence[Pa
         if target.exists() and not target.is_dir():
             sentence = f"this is a file, but the {kind.content} is a folder. Choose another name"
             raise FileError(sentence, path)
-        _refuse_place(path, target)
+        is_mount = target.is_mount()
+        if is_mount or Path.cwd().is_relative_to(target):
+            example = str(path / "result")
+            finding = report_finding("files.folder-in-place", is_mount=is_mount, example=example)
+            raise FileError(finding, path)
+        parent = next(folder for folder in target.parents if folder.exists())
+        if not parent.is_dir():
+            sentence = f"cannot write here: {parent} is not a folder. Choose another place"
+            raise FileError(sentence, path)
+        if not os.access(parent, os.W_OK | os.X_OK):
+            raise FileError("cannot write here (permission denied). Choose another folder", path)
         for file in inputs:
             if file.exists() and file.resolve().is_relative_to(target):
                 sentence = f"replacing this folder would remove the input {file}"
@@ -175,20 +185,6 @@ def refuse_folder(path: Path, kind: FolderKind, force: bool, inputs: Sequence[Pa
             if any(os.path.lexists(p) and not os.access(p, os.W_OK | os.X_OK) for p in places):
                 sentence = "this folder permits no changes"
                 raise FileError(f"{sentence}. Choose another name, or permit writing in it", path)
-
-
-def _refuse_place(path: Path, target: Path) -> None:
-    """Raise FileError where no folder can take this name, as far as is known beforehand."""
-    is_mount = target.is_mount()
-    if is_mount or Path.cwd().is_relative_to(target):
-        example = str(path / "result")
-        finding = report_finding("files.folder-in-place", is_mount=is_mount, example=example)
-        raise FileError(finding, path)
-    parent = next(folder for folder in target.parents if folder.exists())
-    if not parent.is_dir():
-        raise FileError(f"cannot write here: {parent} is not a folder. Choose another place", path)
-    if not os.access(parent, os.W_OK | os.X_OK):
-        raise FileError("cannot write here (permission denied). Choose another folder", path)
 
 
 def _refuse_other_content(path: Path, kind: FolderKind) -> None:

@@ -172,7 +172,18 @@ def _join_poses(files: Sequence[_File], robot: Mechanism) -> dict[str, tuple[int
             elif name not in read and states_readings:
                 sentence = f"pose {name!r} has no readings in any file. Add them in one"
                 raise file.table.row_error(row, sentence)
-        _refuse_contradictions(file, files, repeated)
+        rows, others = list(repeated), list(repeated.values())
+        for what in ("readings", "sigma") if repeated else ():
+            a = getattr(file, what)[rows]
+            b = np.array([getattr(files[of], what)[row] for of, row in others])
+            same = np.isclose(a, b, rtol=ROUNDING, atol=ROUNDING, equal_nan=True)
+            unstated = (np.isnan(a) | np.isnan(b)) & (what == "sigma")
+            for k in np.flatnonzero(~(same | unstated).all(axis=1)):
+                number, other = others[k]
+                place = files[number].table.place(other)
+                sentence = f"pose {file.names[rows[k]]!r} has other {what} here than in {place}"
+                act = "Correct them, or rename the pose in one of the files"
+                raise file.table.row_error(rows[k], f"{sentence}. {act}")
     if not origin:
         why = "no row has readings. Add a row with readings for each pose"
         if all(file.is_base.all() for file in files):
@@ -452,29 +463,6 @@ def _read_reading_sigma(table: Table, robot: Mechanism, readings: FloatArray) ->
                 act = f"Write it, 0 if it is exact, or inf, or give '{READING_NOISE}'"
                 raise table.row_error(int(row), f"{sentence}. {act}")
     return np.where(np.isnan(readings), np.inf, sigma)
-
-
-def _refuse_contradictions(
-    file: _File, files: Sequence[_File], repeated: Mapping[int, tuple[int, int]]
-) -> None:
-    """Raise FileError where two files state different readings, or sigmas, of one pose.
-
-    `repeated` : row of the file -> number of another file, and its row of the same pose.
-    """
-    if not repeated:
-        return
-    rows, others = list(repeated), list(repeated.values())
-    for what in ("readings", "sigma"):
-        a = getattr(file, what)[rows]
-        b = np.array([getattr(files[i], what)[row] for i, row in others])
-        same = np.isclose(a, b, rtol=ROUNDING, atol=ROUNDING, equal_nan=True)
-        unstated = (np.isnan(a) | np.isnan(b)) & (what == "sigma")
-        for i in np.flatnonzero(~(same | unstated).all(axis=1)):
-            number, other = others[i]
-            place = files[number].table.place(other)
-            sentence = f"pose {file.names[rows[i]]!r} has other {what} here than in {place}"
-            act = "Correct them, or rename the pose in one of the files"
-            raise file.table.row_error(rows[i], f"{sentence}. {act}")
 
 
 FORMAT = 1

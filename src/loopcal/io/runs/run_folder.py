@@ -200,41 +200,6 @@ def read_result(path: Path) -> dict[str, Any]:
     return content
 
 
-def refuse_other_parameters(
-    result: Mapping[str, Any], count: int, robot: Mechanism, path: Path
-) -> None:
-    """Refuse a robot, read from `path`, that lacks parameters that a result identified, of `count`
-    in all. Others may be free, too, because a choice of the model identifies some of them.
-    """
-    stated = [row["name"] for row in result["fit"]["parameters"]]
-    identified, table = set(stated), robot.parameters
-    names = [name for name, is_free in zip(table.names, table.free, strict=True) if is_free]
-    if [name for name in names if name in identified] == stated and count == len(table):
-        return
-    different = sorted(identified - set(names)) or names
-    raise FileError(
-        report_finding("files.run-robot-changed", result=RESULT, name=different[0]), path
-    )
-
-
-def refuse_other_estimates(
-    path: Path, result: Mapping[str, Any], key: str, array: np.ndarray, name: str
-) -> None:
-    """Refuse a result, read from `path`, whose rows under `fit`, of this `key`, state other
-    estimates than the array [SI] of its run.
-    """
-    rows, holds = result["fit"].get(key, ()), f"but the array {name!r} of the run holds"
-    if len(array) != len(rows):
-        raise report_damage(path, f"'fit.{key}' has {len(rows)} entries, {holds} {len(array)}")
-    for row, value in zip(rows, array.tolist(), strict=True):
-        if row.get("estimate") is None or "unit" not in row:  # of an earlier version
-            continue
-        factor = UNITS[row["unit"]].factor_to_si if row["unit"] in UNITS else math.nan
-        if not math.isclose(row["estimate"] * factor, value, rel_tol=ROUNDING):
-            stated = f"{row['estimate']!r} {row['unit']} for {row['name']}"
-            raise report_damage(path, f"'fit.{key}' states {stated}, {holds} {value!r} [SI]")
-
-
 def report_damage(path: Path, problem: str) -> FileError:
     """Return the error of a file of a run that is damaged; `problem` says how."""
     return FileError(report_finding("files.run-damaged", problem=problem), path)
@@ -408,22 +373,6 @@ GROUPS = (
 FITTED_NAME = re.compile(r"fitted_\d+_.+", re.DOTALL)
 TYPES = {"finite": "f", "number": "f", "whole": "i", "logical": "b", "text": "U"}
 """Word for an entry -> letter of its type in NumPy."""
-
-
-def read_run_arrays(path: Path, digest: str | None) -> dict[str, np.ndarray]:
-    """Return the arrays of a run by name; FileError for damage, or an array of another form.
-
-    `digest` is the SHA-256 of arrays.npz that result.json states; None in format 1.
-    """
-    if digest is not None and sha256(path) != digest:
-        raise report_damage(path, "it is not the file that result.json names")
-    try:
-        arrays = read_arrays(path)
-    except ValueError as error:
-        raise report_damage(path, f"reading it fails ({error})") from error
-    if problem := find_problem(arrays, is_complete=digest is not None):
-        raise report_damage(path, problem)
-    return arrays
 
 
 def find_problem(arrays: Mapping[str, np.ndarray], is_complete: bool = True) -> str | None:
@@ -777,10 +726,27 @@ def read_run_folder(path: str | Path) -> tuple[dict[str, Any], dict[str, np.ndar
         raise FileError(f"{sentence}. Restore it, or repeat the calibration", path)
     result = read_result(path / RESULT)
     digest = result["files"].get(ARRAYS, "none") if "files" in result else None
-    arrays = read_run_arrays(path / ARRAYS, digest)
+    if digest is not None and sha256(path / ARRAYS) != digest:
+        raise report_damage(path / ARRAYS, "it is not the file that result.json names")
+    try:
+        arrays = read_arrays(path / ARRAYS)
+    except ValueError as error:
+        raise report_damage(path / ARRAYS, f"reading it fails ({error})") from error
+    if problem := find_problem(arrays, is_complete=digest is not None):
+        raise report_damage(path / ARRAYS, problem)
     for name, key in (("estimate", "parameters"), ("local_estimate", "local")):
-        if name in arrays:
-            refuse_other_estimates(path / RESULT, result, key, arrays[name], name)
+        rows, holds = result["fit"].get(key, ()), f"but the array {name!r} of the run holds"
+        estimates = arrays[name].tolist() if name in arrays else []
+        if name in arrays and len(estimates) != len(rows):
+            stated = f"'fit.{key}' has {len(rows)} entries, {holds} {len(estimates)}"
+            raise report_damage(path / RESULT, stated)
+        for row, value in zip(rows, estimates, strict=False):
+            if row.get("estimate") is None or "unit" not in row:  # of an earlier version
+                continue
+            factor = UNITS[row["unit"]].factor_to_si if row["unit"] in UNITS else math.nan
+            if not math.isclose(row["estimate"] * factor, value, rel_tol=ROUNDING):
+                stated = f"'fit.{key}' states {row['estimate']!r} {row['unit']} for {row['name']}"
+                raise report_damage(path / RESULT, f"{stated}, {holds} {value!r} [SI]")
     return result, arrays
 
 
@@ -839,7 +805,13 @@ def load_run(path: str | Path) -> Run:
     result, arrays = read_run_folder(path)
     robot = load_robot(_find_robot_file(path))
     before = arrays.get("initial", robot.parameters.nominal)
-    refuse_other_parameters(result, len(before), robot, _find_robot_file(path))
+    # others may be free, too, because a choice of the model identifies some of them
+    stated, table = [row["name"] for row in result["fit"]["parameters"]], robot.parameters
+    free = [name for name, is_free in zip(table.names, table.free, strict=True) if is_free]
+    if [name for name in free if name in stated] != stated or len(before) != len(table):
+        name = (sorted({*stated} - {*free}) or free)[0]
+        finding = report_finding("files.run-robot-changed", result=RESULT, name=name)
+        raise FileError(finding, _find_robot_file(path))
     initial = robot.with_values(before)
     names = [update_setup_name(row["name"]) for row in result["fit"].get("local", ())]
     values, initial_values = (

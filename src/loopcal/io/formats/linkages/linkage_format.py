@@ -279,21 +279,14 @@ def read(tree: LinkTree, options: ImportOptions, what: str) -> Imported:
     head = format_head(path, what, family, options.name, ("m", "rad"), remark)
     text = head + format_yaml(describe_robot(mechanism, paths, frame))
     findings = (*tree.notes, *_report_structure(mechanism, paths, frame))
-    return Imported(text, None, findings, _doubt_file(mechanism, paths))
-
-
-def _doubt_file(mechanism: Linkage, paths: StagePaths) -> Finding | None:
-    """Return that motors are missing, or that rigid closures probably stand for pins where motors
-    exceed the mobility.
-    """
-    motors, mobility = len(paths.graph.motors), paths.motions.mobility
+    # motors are missing, or rigid closures probably stand for pins if motors exceed the mobility
+    motors, mobility, doubt = len(paths.graph.motors), paths.motions.mobility, None
     if motors < mobility:
-        return report_finding("files.motors-missing", motors=motors, mobility=mobility)
-    if not mechanism.rigid_closures or motors == mobility:
-        return None
-    return report_finding(
-        "files.closure-rigid", closures=mechanism.rigid_closures, motors=motors, mobility=mobility
-    )
+        doubt = report_finding("files.motors-missing", motors=motors, mobility=mobility)
+    elif (rigid := mechanism.rigid_closures) and motors > mobility:
+        code = "files.closure-rigid"
+        doubt = report_finding(code, closures=rigid, motors=motors, mobility=mobility)
+    return Imported(text, None, findings, doubt)
 
 
 def _find_platform(mechanism: Linkage, name: str | None) -> tuple[str, str]:

@@ -72,13 +72,6 @@ class _Reader:
 
     def read_all(self) -> None:
         """Read the settings, and all bodies."""
-        self.read_settings()
-        self.bodies[WORLD] = np.eye(4)
-        for world in self.root.find_all("worldbody"):
-            self.read_body(world, WORLD, np.eye(4), "main")
-
-    def read_settings(self) -> None:
-        """Read the settings of the compiler and the classes of defaults."""
         for compiler in self.root.find_all("compiler"):
             stated = compiler.attributes
             self.degrees = stated.get("angle", "degree" if self.degrees else "radian") == "degree"
@@ -88,6 +81,9 @@ class _Reader:
                 raise compiler.error("coordinates are global. Write coordinate='local'")
         for default in self.root.find_all("default"):
             self._read_defaults(default, {})
+        self.bodies[WORLD] = np.eye(4)
+        for world in self.root.find_all("worldbody"):
+            self.read_body(world, WORLD, np.eye(4), "main")
 
     def _read_defaults(self, element: Element, above: Mapping[str, dict[str, str]]) -> None:
         """Read a class of defaults and those in it."""
@@ -453,7 +449,7 @@ def rewrite(tree: LinkTree, other: LinkTree) -> str:
     raw = tree.text.encode()
     reader = _Reader(_include(parse_xml(tree.text, tree.path, WHAT), tree.path))
     reader.read_all()
-    after, edits = draw_links(other), []
+    (drawn, after), edits = map(draw_links, (tree, other)), list[Edit]()
     for body, element in reader.elements.items():
         parent = reader.carriers[body]
         if body not in after or parent not in after:
@@ -467,8 +463,16 @@ def rewrite(tree: LinkTree, other: LinkTree) -> str:
         chain = [tree.carrier[body]]
         while chain[-1].parent != parent:
             chain.append(tree.carrier[chain[-1].parent])
-        for joint in (joint for joint in chain if joint.kind and joint.element is not None):
-            edits += _write_joint(tree, raw, joint, reader, after[body], after[joint.child], body)
+        for joint in chain:
+            if not joint.kind or (element := joint.element) is None:
+                continue
+            old, new = (geometry.invert_pose(at[body]) @ at[joint.child] for at in (drawn, after))
+            for key, stated, now in (
+                ("pos", old[:3, 3], new[:3, 3]),
+                ("axis", old[:3, :3] @ joint.axis, new[:3, :3] @ joint.axis),
+            ):
+                if np.abs(now - stated).max() > SAME and (key == "pos" or joint.kind != "S"):
+                    edits.append(_replace(tree, raw, element, key, now))
     for closure in _read_closures(reader, dict.fromkeys((tree.root, *tree.carrier))):
         for k, end in enumerate(closure.constraint.ends):
             T = other.places[end.name].origin
@@ -484,28 +488,6 @@ def rewrite(tree: LinkTree, other: LinkTree) -> str:
                 place = element.parse_numbers(stated, 3, key) + shift
                 edits.append(_replace(tree, raw, element, key, place))
     return apply_edits(tree.text, edits)
-
-
-def _write_joint(
-    tree: LinkTree,
-    raw: bytes,
-    joint: TreeJoint,
-    reader: _Reader,
-    T_body: FloatArray,
-    T_joint: FloatArray,
-    body: str,
-) -> Iterator[Edit]:
-    """Yield the edits of a joint drawn elsewhere in its body; places (4, 4) are in the root."""
-    assert joint.element is not None
-    drawn = draw_links(tree)
-    old = geometry.invert_pose(drawn[body]) @ drawn[joint.child]
-    new = geometry.invert_pose(T_body) @ T_joint
-    for key, before, now in (
-        ("pos", old[:3, 3], new[:3, 3]),
-        ("axis", old[:3, :3] @ joint.axis, new[:3, :3] @ joint.axis),
-    ):
-        if np.abs(now - before).max() > SAME and (key == "pos" or joint.kind != "S"):
-            yield _replace(tree, raw, joint.element, key, now)
 
 
 def _write_pose(

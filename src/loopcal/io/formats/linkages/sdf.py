@@ -342,19 +342,15 @@ def rewrite(tree: LinkTree, other: LinkTree) -> str:
     for element in model.find_all("joint"):
         stated, axis = axes.get(element.attributes.get("name", ""), (np.zeros(3), np.zeros(3)))
         if np.abs(axis - stated).max() > SAME:
-            edits.append(_write_axis(element, axis, before))
+            xyz = element.find("axis", "xyz")
+            if xyz is None or xyz.attributes.get("expressed_in"):
+                name = element.attributes.get("name", "")
+                act = "Write it in the frame of the joint"
+                raise element.error(f"the axis of {name!r} turns. {act}")
+            if element.get("axis", "use_parent_model_frame") in ("1", "true"):
+                axis = before.place_element(element)[:3, :3] @ axis
+            edits.append((xyz.end, xyz.close, format_numbers(axis)))
     return apply_edits(tree.text, edits)
-
-
-def _write_axis(element: Element, axis: FloatArray, frames: Frames) -> Edit:
-    """Return the edit that gives a joint another first axis (3,) in its frame."""
-    xyz = element.find("axis", "xyz")
-    name = element.attributes.get("name", "")
-    if xyz is None or xyz.attributes.get("expressed_in"):
-        raise element.error(f"the axis of {name!r} turns. Write it in the frame of the joint")
-    if element.get("axis", "use_parent_model_frame") in ("1", "true"):
-        axis = frames.place_element(element)[:3, :3] @ axis
-    return xyz.end, xyz.close, format_numbers(axis)
 
 
 def write_pose(tree: LinkTree, element: Element, T: FloatArray, stated: FloatArray) -> Edit:
