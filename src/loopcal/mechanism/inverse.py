@@ -38,7 +38,7 @@ from loopcal.mechanism.platform_coordinates import (
     read_coordinates,
 )
 from loopcal.mechanism.sensitivity import differentiate_by_drives
-from loopcal.mechanism.states import Status, driven_values, replace_rows, without_poses
+from loopcal.mechanism.states import Status, driven_values, put_poses, without_poses
 from loopcal.mechanism.transmission import (
     apply_weights,
     find_fixed_rows,
@@ -658,8 +658,7 @@ def find_nearest_reachable(
         last = map_arrays(lambda a: a[None, moved, 0], last)
         near = read_coordinates(last.T, robot.controlled)
         last = close_at_coordinates(robot, values, near, last, follow=False)
-        new = map_arrays(lambda a: a[0, :, None], last)
-        state = replace_rows(state, np.zeros_like(moved), closed[moved], new)
+        state = put_poses(state, closed[moved], last)
     state.status[0, closed[ended_early]] = Status.NOT_CONVERGED
     return state
 

@@ -46,14 +46,7 @@ from loopcal.mechanism.platform_coordinates import (
     state_target,
 )
 from loopcal.mechanism.sensitivity import differentiate_pose
-from loopcal.mechanism.states import (
-    Status,
-    driven_values,
-    is_closed,
-    replace_rows,
-    reshape_rows,
-    select_poses,
-)
+from loopcal.mechanism.states import Status, driven_values, is_closed, put_poses, select_poses
 from loopcal.numerics.trial_batch import map_arrays
 from loopcal.results.description import Field, label_axes
 from loopcal.results.result import TableResult
@@ -76,33 +69,6 @@ SAME_JOINTS = 1e-6
 
 Step = Callable[[IntArray, FloatArray, State], State]
 """Returns states (1, j) at shares (j,) of the paths of rows (j,), from states on these paths."""
-
-
-def _connect(
-    robot: Mechanism,
-    first: State,
-    last: State,
-    connected: BoolArray,
-    path: Callable[[Mechanism, State, State], Step],
-) -> tuple[State, BoolArray]:
-    """Follow a kind of straight path from states `first` to `last` (1, k), but for rows that are
-    known to be connected.
-
-    Return the last states, with the passive joints at the end of a path, and which are connected.
-    """
-    rows = np.flatnonzero(~connected)
-    if not len(rows):
-        return last, connected
-    start, goal = select_poses(first, rows), select_poses(last, rows)
-    end, arrived = _follow_path(robot, start, path(robot, start, goal))
-    arrived &= _is_same_pose(robot, end, goal, SAME_JOINTS)
-    connected = connected.copy()
-    connected[rows] = arrived
-    differs = arrived & (measure_distance(robot, goal, end) > SAME_JOINTS)
-    rows, end = rows[differs], select_poses(end, differs)
-    new = replace(select_poses(last, rows), T=end.T, joints=end.joints)
-    last = replace_rows(last, np.zeros_like(rows), rows, reshape_rows(new, len(rows), 1))
-    return last, connected
 
 
 def contracts(robot: Mechanism, start: State, end: State) -> BoolArray:
@@ -187,7 +153,7 @@ def _follow_path(robot: Mechanism, first: State, step: Step) -> tuple[State, Boo
         share[rows] = np.where(safe, wanted, share[rows])
         length[rows] *= np.where(safe, GROWTH, GROWTH**-2)
         done, kept = rows[safe], select_poses(following, safe)
-        current = replace_rows(current, np.zeros_like(done), done, reshape_rows(kept, len(done), 1))
+        current = put_poses(current, done, kept)
     return current, share >= 1.0
 
 
@@ -227,19 +193,17 @@ def solve_in_mode(
     state = replace(state, status=status)
     if has_one_solution(robot) or moves_by_drives(robot):  # which follows the path itself
         return state
-    first = select_poses(repeat_poses(begin, len(is_other)), rows)
-    near, arrived = _follow_poses(robot, first, select_poses(state, rows))
+    begin = repeat_poses(begin, len(is_other))
+    near, arrived = _follow_poses(robot, select_poses(begin, rows), select_poses(state, rows))
     near, rows = _select_new(robot, near, state, rows[arrived])
     if not len(rows):
         return state
     again, rows = _select_new(robot, solve(target[rows], near)[0], state, rows)
     if not len(rows):
         return state
-    first = select_poses(repeat_poses(begin, len(is_other)), rows)
-    again, still_other = judge_modes(robot, again, first)
+    again, still_other = judge_modes(robot, again, select_poses(begin, rows))
     good = (again.status[0] == Status.CONVERGED) & ~still_other
-    rows, new = rows[good], select_poses(again, good)
-    return replace_rows(state, np.zeros_like(rows), rows, reshape_rows(new, len(rows), 1))
+    return put_poses(state, rows[good], select_poses(again, good))
 
 
 def _select_new(
@@ -328,8 +292,7 @@ def judge_modes(
         return state, is_other
     first = select_poses(begin, rows) if begin.T.shape[1] == n > 1 else begin
     judged, is_other[rows] = _judge_paths(robot, first, select_poses(state, rows))
-    new = reshape_rows(judged, len(rows), 1)
-    return replace_rows(state, np.zeros_like(rows), rows, new), is_other
+    return put_poses(state, rows, judged), is_other
 
 
 def _judge_stages(robot: Mechanism, state: State, begin: State) -> tuple[State, BoolArray]:
@@ -346,7 +309,8 @@ def _judge_stages(robot: Mechanism, state: State, begin: State) -> tuple[State, 
 
 
 def _judge_paths(robot: Mechanism, first: State, goal: State) -> tuple[State, BoolArray]:
-    """Return goals (1, k) of the right sign, and which of them `first` (1, k | 1) does not lead to.
+    """Return goals (1, k) of the right sign with the passive joints at the end of a path, and which
+    of them `first` (1, k | 1) does not lead to.
 
     Newton's method must lead to the pose of a goal from its readings, and a safe path too, where
     readings determine the joints.
@@ -357,17 +321,19 @@ def _judge_paths(robot: Mechanism, first: State, goal: State) -> tuple[State, Bo
     is_other &= (back.status[0] != Status.CONVERGED) | ~_is_same_pose(robot, back, goal, SAME_POSE)
     rows = np.flatnonzero(~is_other & (loops.weights is None))
     start = repeat_poses(first, len(is_other))
+    rows = rows[~contracts(robot, select_poses(start, rows), select_poses(goal, rows))]
     for path in (_move_readings, _move_poses):
         if not len(rows):
             break
         begin, end = select_poses(start, rows), select_poses(goal, rows)
-        known = np.zeros(len(rows), bool)
-        if path is _move_readings:
-            known = contracts(robot, begin, end)
-        solutions, connected = _connect(robot, begin, end, known, path)
-        goal = replace_rows(goal, np.zeros_like(rows), rows, reshape_rows(solutions, len(rows), 1))
-        is_other[rows] = ~connected
-        rows = rows[~connected]
+        last, arrived = _follow_path(robot, begin, path(robot, begin, end))
+        arrived &= _is_same_pose(robot, last, end, SAME_JOINTS)
+        differs = arrived & (measure_distance(robot, end, last) > SAME_JOINTS)
+        at_end = select_poses(last, differs)
+        new = replace(select_poses(end, differs), T=at_end.T, joints=at_end.joints)
+        goal = put_poses(goal, rows[differs], new)
+        is_other[rows] = ~arrived
+        rows = rows[~arrived]
     return goal, is_other
 
 

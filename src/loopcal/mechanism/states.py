@@ -85,9 +85,9 @@ def replace_rows(state: State, trial: np.ndarray, pose: np.ndarray, new: State) 
     return map_arrays(replaced, state, new)
 
 
-def reshape_rows(state: State, t: int, n: int) -> State:
-    """Return the rows of a state (t n, 1) as (t, n)."""
-    return map_arrays(lambda a: a.reshape(t, n, *a.shape[2:]), state)
+def put_poses(state: State, rows: np.ndarray, new: State) -> State:
+    """Return a state (1, n) whose poses at rows (k,) are those of `new` (1, k)."""
+    return replace_rows(state, np.zeros_like(rows), rows, map_arrays(lambda a: a[0, :, None], new))
 
 
 def driven_values(program: Program, state: State) -> FloatArray:
