@@ -29,7 +29,7 @@ from loopcal.mechanism.chains import (
     transport_twists,
 )
 from loopcal.mechanism.kinematics import close_at_joints, compute_closure_sign, solve_serial
-from loopcal.mechanism.limb_rows import measure_rod, move_serial, place_serial, sum_displacements
+from loopcal.mechanism.limb_rows import measure_rod, move_serial, place_links, place_serial
 from loopcal.mechanism.model import Mechanism, Stage
 from loopcal.mechanism.platform_coordinates import (
     POSITION,
@@ -209,9 +209,7 @@ def _bound_by_limbs(robot: Mechanism, values: FloatArray) -> tuple[FloatArray, F
             slides = "P" in group.joints or bool(group.pitch[k].any()) or group.actuator[-1, k] >= 0
             if slides or any(slot.axis == PITCH for slot in group.slots):
                 continue  # a joint changes the distance of its neighbors
-            move, _ = sum_displacements(group, k, displacements[:, k])
-            links = group.links[k]
-            origins = links[:, :3, 3] + np.matmul(links[:, :3, :3], move[..., 3:, None])[..., 0]
+            origins = place_links(group, k, displacements[:, k])[0][..., :3, 3]
             length = np.linalg.norm(origins[:, 1:], axis=-1).sum(axis=1)
             length = length + measure_rod(group, k, displacements[:, k])
             shorter = length < radius

@@ -90,6 +90,14 @@ def linearize_limbs(
             yield rows, engine.linearize(robot.program, select_block(e, rows[:1]), joints, part)
 
 
+def linearize_state(
+    robot: Mechanism, state: State, values: FloatArray | None = None, free: bool = False
+) -> engine.ClosureBlocks:
+    """Linearize all limbs at a state (t, n), at the present values without others (t | 1, p)."""
+    e, _ = robot.slots(robot.values[None] if values is None else values)
+    return engine.linearize(robot.program, e, driven_values(robot.program, state), state, free)
+
+
 def select_block(array: FloatArray, rows: tuple[slice, ...]) -> FloatArray:
     """Return a block of an array whose leading axes may be 1 and then broadcast."""
     pairs = zip(rows, array.shape, strict=False)

@@ -27,7 +27,12 @@ from loopcal.mechanism.assembly import (
     refuse_more,
     select_rows,
 )
-from loopcal.mechanism.limb_rows import reduce_to_platform, stack_closure_rows, stack_driven_columns
+from loopcal.mechanism.limb_rows import (
+    linearize_state,
+    reduce_to_platform,
+    stack_closure_rows,
+    stack_driven_columns,
+)
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import (
     COORDINATES,
@@ -59,8 +64,7 @@ MAIN_SHARE = 0.3
 def check_mobility(robot: Mechanism) -> None:
     """Refuse actuators that cannot move and hold the platform at home; the error names freedoms."""
     program, home = robot.program, robot.home_state
-    e = robot.slots(robot.values[None])[0]
-    blocks = engine.linearize(program, e, driven_values(program, home), home)
+    blocks = linearize_state(robot, home)
     scale = 1 / robot.twist_scale[list(program.freedoms)]
     lost = [
         robot.assembly.limbs[limb].name
@@ -128,12 +132,10 @@ def check_mobility(robot: Mechanism) -> None:
 
 def refuse_free_bodies(robot: Mechanism, state: engine.State) -> None:
     """Refuse bodies that can move while platform and actuators rest, at a state (1, 1)."""
-    program, e = robot.program, robot.slots(robot.values[None])[0]
-    if not program.others:
+    if not robot.program.others:
         return
-    m, columns = len(program.freedoms), program.unknown_twists
-    blocks = engine.linearize(program, e, driven_values(program, state), state)
-    rows = stack_closure_rows(blocks)[0, 0]
+    m, columns = len(robot.program.freedoms), robot.program.unknown_twists
+    rows = stack_closure_rows(linearize_state(robot, state))[0, 0]
     scale = [1 / robot.twist_scale[f] for _, f in columns[m:]]
     _, s, V = np.linalg.svd(rows[:, m:] * scale, full_matrices=True)
     if (rank := count_rank(s)) < len(scale):
@@ -175,12 +177,10 @@ def _check_open_sums(robot: Mechanism, blocks: engine.ClosureBlocks) -> None:
 
 def refuse_uncontrolled(robot: Mechanism, state: engine.State) -> None:
     """Refuse coordinates that do not determine the motion of the platform, at a state (1, 1)."""
-    program = robot.program
-    e, q = robot.slots(robot.values[None])[0], driven_values(program, state)
-    blocks = engine.linearize(program, e, q, state, free=True)
-    rows = reduce_to_platform(program, blocks)[0][0, 0]
+    blocks = linearize_state(robot, state, free=True)
+    rows = reduce_to_platform(robot.program, blocks)[0][0, 0]
     columns = _differentiate_controlled(robot, state.T[0, 0])
-    scale = 1 / robot.twist_scale[list(program.freedoms)]
+    scale = 1 / robot.twist_scale[list(robot.program.freedoms)]
     s = np.linalg.svd(np.concatenate([rows, columns]) * scale, compute_uv=False)
     if count_rank(s) < len(scale):
         raise MechanismError(_word_dependent(robot, len(robot.controlled)))
@@ -192,9 +192,8 @@ def refuse_singular_home(robot: Mechanism, state: engine.State) -> None:
     """
     if not state.residual[0, 0] < CLOSED * robot.size:
         return
-    program, e = robot.program, robot.slots(robot.values[None])[0]
-    blocks = engine.linearize(program, e, driven_values(program, state), state)
-    motion = np.linalg.norm(stack_driven_columns(program, blocks)[0, 0], axis=0)
+    columns = stack_driven_columns(robot.program, linearize_state(robot, state))
+    motion = np.linalg.norm(columns[0, 0], axis=0)
     names = robot.assembly.driven_joints
     turning = {j.actuator for limb in robot.assembly.limbs for j in limb.joints if j.kind == "R"}
     turns = np.array([name in turning for name in names])

@@ -26,13 +26,14 @@ from loopcal.mechanism.assembly import AXES, Assembly
 from loopcal.mechanism.kinematics import compute_readings, forward_trials
 from loopcal.mechanism.limb_rows import (
     divide_limbs,
+    linearize_state,
     stack_closure_rows,
     stack_displacement_columns,
     stack_driven_columns,
 )
 from loopcal.mechanism.mobility import RANK, check_assembly, count_rank
 from loopcal.mechanism.model import Mechanism
-from loopcal.mechanism.states import Status, driven_values, join_states, select_poses
+from loopcal.mechanism.states import Status, join_states, select_poses
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
 SAME = 1e-6
@@ -64,9 +65,11 @@ class _Rows(NamedTuple):
     limb: IntArray
     absorbed: FloatArray
 
-    def find_repeated(self, limbs: IntArray) -> FloatArray:
-        """Return orthonormal combinations (r, c) of the rows of some limbs that repeat others."""
-        own = np.isin(self.limb, limbs)
+    def find_repeated(self, limbs: int | None = None) -> FloatArray:
+        """Return orthonormal combinations (r, c) of the rows that repeat others, of all limbs or of
+        so many first ones.
+        """
+        own = self.limb < (self.limb.max() + 1 if limbs is None else limbs)
         both = np.concatenate([self.A, self.Q], axis=1)[own]
         left, s, _ = np.linalg.svd(both, full_matrices=True)
         out = np.zeros((len(both) - count_rank(s), len(own)))
@@ -89,8 +92,7 @@ def _find_basis(vectors: FloatArray) -> FloatArray:
 
 def _linearize(robot: Mechanism, state: State) -> list[_Rows]:
     """Return the equations at the poses of a state (1, n), at the nominal values."""
-    program, e = robot.program, robot.slots(robot.parameters.nominal[None])[0]
-    blocks = engine.linearize(program, e, driven_values(program, state), state)
+    program, blocks = robot.program, linearize_state(robot, state, robot.parameters.nominal[None])
     scale = 1 / robot.twist_scale[[f for _, f in program.unknown_twists]]
     A, Q = stack_closure_rows(blocks)[0] * scale, stack_driven_columns(program, blocks)[0]
     E, absorbed = (
@@ -109,7 +111,7 @@ def report_over_constraint(
     """
     asks = robot.assembly.closure == "least-squares"
     rows = _linearize(robot, robot.home_state)[0]
-    count = _count_repeated(robot, rows)
+    count = len(rows.find_repeated())
     if not count:
         without = (report_finding("mechanism.closure-without-effect"),) if asks else ()
         return replace(robot, findings=(*robot.findings, *without))
@@ -125,16 +127,11 @@ def report_over_constraint(
     return replace(robot, program=program, findings=(*robot.findings, finding))
 
 
-def _count_repeated(robot: Mechanism, rows: _Rows) -> int:
-    """Return how many closure equations repeat others."""
-    return len(rows.find_repeated(np.arange(len(robot.assembly.limbs))))
-
-
 def _list_repeated(robot: Mechanism, rows: _Rows) -> tuple[dict[str, Any], ...]:
     """Return, for each limb that repeats limbs before it in the file, the directions by limbs."""
     names, out = [limb.name for limb in robot.assembly.limbs], []
     for last in range(len(names)):
-        stresses = rows.find_repeated(np.arange(last + 1))[:, rows.limb == last]
+        stresses = rows.find_repeated(last + 1)[:, rows.limb == last]
         wrenches = _find_basis(stresses @ rows.A[rows.limb == last])
         by_others: dict[tuple[str, ...], list[dict[str, Any]]] = {}
         for wrench, direction in _name_directions(wrenches, _list_columns(robot, last)):
@@ -240,7 +237,7 @@ def _find_sufficient_freedoms(
             with suppress(MechanismError):
                 check_assembly(narrow)
                 flat = close_at_home(narrow)
-                if not _count_repeated(flat, _linearize(flat, flat.home_state)[0]):
+                if not len(_linearize(flat, flat.home_state)[0].find_repeated()):
                     return names
     return ()
 
@@ -250,10 +247,8 @@ def find_self_stress(robot: Mechanism) -> FloatArray:
     the body on which they end with rotations over the robot's size.
     """
     rows = _linearize(robot, robot.home_state)[0]
-    numbers = np.arange(len(robot.assembly.limbs))
-    stresses = rows.find_repeated(numbers)
-    own = []
-    for i in numbers.tolist():
+    stresses, own = rows.find_repeated(), []
+    for i in range(len(robot.assembly.limbs)):
         columns = list(_list_columns(robot, i).values())
         own.append(stresses[:, rows.limb == i] @ rows.A[rows.limb == i][:, columns])
     return np.stack(own, axis=1)
@@ -327,10 +322,10 @@ def _detect_breaking(robot: Mechanism) -> BoolArray:
         breaks[stage.parameters] = _detect_breaking(stage.robot)
     if robot.stages or robot.program.may_stay_open or not is_over_constrained(robot):
         return breaks
-    numbers, d = np.arange(len(robot.assembly.limbs)), robot.program.n_displacements
+    d = robot.program.n_displacements
     slopes = robot.slots.jacobian(robot.parameters.nominal[None])[0, :d]
     for rows in _linearize(robot, find_nearby_states(robot)):
-        opened = np.linalg.norm(rows.find_repeated(numbers) @ rows.E @ slopes, axis=0)
+        opened = np.linalg.norm(rows.find_repeated() @ rows.E @ slopes, axis=0)
         effect = np.linalg.norm(np.concatenate([rows.E, rows.absorbed]) @ slopes, axis=0)
         breaks |= opened > BREAKS * effect
     return breaks

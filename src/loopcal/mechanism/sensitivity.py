@@ -183,39 +183,39 @@ def differentiate_passive_joints(
             whole.readings[:, :, rows, stage.actuators] = moved.readings
             first = rows.stop
         return PassiveSensitivity(names, *whole)
-    nodes, p = len(robot.program.nodes), len(robot.parameters)
-    platform = differentiate_pose(robot, values, q, state, nodes=nodes)
-    freedoms = [6 * node + f for node, f in robot.program.unknown_twists]
-    twists = np.concatenate(platform, axis=3)[:, :, freedoms]
+    program, p = robot.program, len(robot.parameters)
+    exact = None
+    if program.may_stay_open and not robot.has_open_sums:
+        unknowns = _differentiate_open_unknowns(robot, values, q, state)
+        twists, exact = np.split(unknowns, [len(program.unknown_twists)], axis=2)
+    else:
+        nodes = differentiate_pose(robot, values, q, state, nodes=len(program.nodes))
+        freedoms = [6 * node + f for node, f in program.unknown_twists]
+        twists = np.concatenate(nodes, axis=3)[:, :, freedoms]
     driven = differentiate_driven_joints(robot, values, q, state)
     by_inputs = move_passive_joints(robot, values, state, twists, driven)
-    if robot.program.may_stay_open and not robot.has_open_sums:
-        places, exact = _differentiate_open_joints(robot, values, q, state, names)
+    if exact is not None:
+        limbs = robot.assembly.limbs
+        joints = [(limbs[i], limbs[i].joints[j]) for i, j in list_unknown_joints(program)]
+        places = [names.index(f"{limb.name}.{joint.name}") for limb, joint in joints]
         by_inputs[:, :, places] = exact
     by_inputs[~is_closed(state.status)] = np.nan
     return PassiveSensitivity(names, by_inputs[..., :p], by_inputs[..., p:])
 
 
-def _differentiate_open_joints(
-    robot: Mechanism, values: FloatArray, q: FloatArray, state: State, names: Sequence[str]
-) -> tuple[list[int], FloatArray]:
-    """Return the places in `names` of joints whose loops may stay open, and their derivatives by
-    parameters and readings (t, n, j, p + a).
-    """
-    program, limbs = robot.program, robot.assembly.limbs
+def _differentiate_open_unknowns(
+    robot: Mechanism, values: FloatArray, q: FloatArray, state: State
+) -> FloatArray:
+    """Return what `differentiate_unknowns` returns, by parameters and readings (t, n, u, p + a)."""
     e, tau = robot.slots(values)
     joints = joints_from_readings(q, tau, robot.slots.constants)
     inputs = robot.all_parameters.linearize(values, tau, q)
-    exact = differentiate_unknowns(program, e, joints, state, inputs)
+    exact = differentiate_unknowns(robot.program, e, joints, state, inputs)
     if robot.has_sums:
         own, by_joints = np.split(exact, [len(robot.parameters)], axis=-1)
         turns = differentiate_joints_by_readings(robot, values, q)
         exact = np.concatenate([own, by_joints @ turns], axis=-1)
-    places = [
-        names.index(f"{limbs[i].name}.{limbs[i].joints[j].name}")
-        for i, j in list_unknown_joints(program)
-    ]
-    return places, exact[:, :, len(program.unknown_twists) :]
+    return exact
 
 
 def differentiate_sensed_values(

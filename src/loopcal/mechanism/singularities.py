@@ -20,7 +20,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from loopcal import engine
 from loopcal.engine import State
 from loopcal.errors import DataError
 from loopcal.findings import Finding, report_finding
@@ -28,13 +27,13 @@ from loopcal.mechanism.actuation import differentiate_unknowns_by_sums
 from loopcal.mechanism.assembly import AXES
 from loopcal.mechanism.chains import find_carrying_actuators, split_stage_states, transport_to_end
 from loopcal.mechanism.kinematics import compute_closure_sign, compute_readings
-from loopcal.mechanism.limb_rows import reduce_to_platform
+from loopcal.mechanism.limb_rows import linearize_state, reduce_to_platform
 from loopcal.mechanism.mobility import list_main_freedoms
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import compare_coordinates, read_coordinates
 from loopcal.mechanism.sensitivity import differentiate_pose
 from loopcal.mechanism.solutions import Solution, forward, inverse, make_solution
-from loopcal.mechanism.states import driven_values, join_states
+from loopcal.mechanism.states import join_states
 from loopcal.mechanism.transmission import find_fixed_rows, invert_weights, select_weights
 from loopcal.mechanism.workspace import sample_workspace
 from loopcal.numerics.statistics import compute_median
@@ -272,9 +271,7 @@ def _scale_closure(robot: Mechanism, state: State) -> tuple[FloatArray, FloatArr
     """Return A (n, c, m) and Q (n, c, a) in meters at a state (1, n) of a machine without stages,
     zero where a number is not finite, and where all are finite (n,).
     """
-    program = robot.program
-    e, _ = robot.slots(robot.values[None])
-    blocks = engine.linearize(program, e, driven_values(program, state), state)
+    program, blocks = robot.program, linearize_state(robot, state)
     turning = np.array([a.dimension is Dimension.ANGLE for a in robot.actuators])
     A, Q = (rows[0] for rows in reduce_to_platform(program, blocks))
     if robot.has_sums:

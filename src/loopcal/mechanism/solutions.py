@@ -37,7 +37,7 @@ from loopcal.mechanism.kinematics import (
     forward_trials,
     load_readings,
 )
-from loopcal.mechanism.limb_rows import name_passive_joints, reduce_to_platform
+from loopcal.mechanism.limb_rows import name_passive_joints
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import (
     POSITION,
@@ -168,7 +168,7 @@ SAME_POSE = 1e-7
 
 Rounding grows close to a singularity, up to the square root of the machine precision.
 """
-STEPS = 8
+STEPS = 4
 """Steps of the path from the start's pose to a target."""
 
 Solver = Callable[[FloatArray, State | None], tuple[State, BoolArray | None]]
@@ -664,24 +664,9 @@ def differentiate_by_coordinates(robot: Mechanism, values: FloatArray, state: St
     """Return d twist / d coordinate (t, n, 6, c) [1/m, 1], every actuator free, in the units of
     `compare_coordinates`.
     """
-    names, freedoms = robot.controlled, list(robot.program.freedoms)
-    t, n = state.T.shape[:2]
+    names, (t, n) = robot.controlled, state.T.shape[:2]
     flat = state.T.reshape(-1, 4, 4)
     _, columns = compare_coordinates(flat, read_coordinates(flat, names), names, robot.size)
     columns = columns.reshape(t, n, len(names), 6)
-    if moves_by_drives(robot):
-        q = compute_readings(robot, values, state)
-        D = differentiate_pose(robot, values, q, state).readings
-        return np.matmul(D, np.linalg.pinv(np.nan_to_num(np.matmul(columns, D))))
-    e, _ = robot.slots(values)
-    unused = np.zeros((1, n, robot.program.n_joints))
-    blocks = engine.linearize(robot.program, e, unused, state, free=True)
-    rows, _ = reduce_to_platform(robot.program, blocks)
-    both = np.concatenate([rows, columns[..., freedoms]], axis=2)
-    right = np.zeros((*both.shape[:3], len(names)))
-    right[:, :, rows.shape[2] :] = np.eye(len(names))
-    out = np.zeros((t, n, 6, len(names)))
-    good = np.asarray(np.isfinite(both).all(axis=(-1, -2)))
-    solved = np.matmul(np.linalg.pinv(both[good]), right[good])
-    out[good[..., None] & np.isin(np.arange(6), freedoms)] = solved.reshape(-1, len(names))
-    return out
+    D = differentiate_pose(robot, values, compute_readings(robot, values, state), state).readings
+    return np.matmul(D, np.linalg.pinv(np.nan_to_num(np.matmul(columns, D))))

@@ -287,6 +287,23 @@ def test_nearest_pose_of_a_3_prs_minimizes_the_distance():
         assert (np.minimum(ahead, behind) >= best).all()
 
 
+@pytest.mark.parametrize(("name", "least"), [("jansen-leg", 30), ("klann-leg", 21)])
+def test_poses_far_from_a_leg_are_projected(name: str, least: int) -> None:
+    # plain Gauss-Newton steps, which shrink by a constant share, end before 24 and 18 of these rows
+    robot, n = load_cached_robot(name), 40
+    near = sample_workspace(robot, n).solution.T
+    twist = np.random.default_rng(1).normal(size=(n, 6)) * np.repeat([1.0, 0.3 * robot.size], 3)
+    target = geometry.apply_twist(near, twist)
+    solution = inverse(robot, target)
+    done = solution.take(solution.converged)
+    assert len(done) >= least
+    best = squared_distance(robot, done.T, target[solution.converged])
+    for step in (-1e-4, 1e-4):  # of the crank [rad]
+        moved = forward(robot, done.q + step, start=done)
+        there = squared_distance(robot, moved.T, target[solution.converged])
+        assert (there[moved.converged] > best[moved.converged]).all()
+
+
 def test_reachable_pose_is_its_own_nearest_pose():
     robot, sol, _ = sample_inverse("three_prs", 20)
     back = inverse(robot, sol.T)

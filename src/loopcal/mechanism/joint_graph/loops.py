@@ -250,16 +250,33 @@ class JointGraph:
             left = np.flatnonzero(~is_closed)
             if not left.size:
                 break
-            residual, rows = self.linearize(q[left])
+            residual, step = self._propose(q[left], free, CLOSURE_RANK_TOLERANCE, LARGEST_STEP)
             is_closed[left] = np.abs(residual).max(axis=1, initial=0.0) < CLOSED
             active = ~is_closed[left]
-            step = np.zeros((int(active.sum()), len(free)))
-            inverse = np.linalg.pinv(rows[active][:, :, free], rcond=CLOSURE_RANK_TOLERANCE)
-            step[:, free] = -(inverse @ residual[active][:, :, None])[:, :, 0]
-            largest = np.abs(step).max(axis=1, initial=1e-300, keepdims=True)
-            q[left[active]] += step * np.minimum(1.0, LARGEST_STEP / largest) * self.units
+            q[left[active]] += step[active]
         q[~is_closed] = np.nan
         return q
+
+    def approach(self, starts: FloatArray) -> FloatArray:
+        """Return joint values (n, j) near starts (n, j) at which the loops are open the least.
+
+        Directions that hardly change the closures are left out of the steps.
+        """
+        q, free = starts, np.ones(len(self.tree), dtype=bool)
+        for _ in range(STARTS):
+            q = q + self._propose(q, free, WEAK, LARGEST_STEP / 2)[1]
+        return q
+
+    def _propose(
+        self, q: FloatArray, free: BoolArray, tolerance: float, largest: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return residuals (n, e) at joint values (n, j), and Newton steps (n, j) of least norm."""
+        residual, rows = self.linearize(q)
+        step = np.zeros(q.shape)
+        inverse = np.linalg.pinv(rows[:, :, free], rcond=tolerance)
+        step[:, free] = -(inverse @ residual[:, :, None])[:, :, 0]
+        length = np.abs(step).max(axis=1, initial=1e-300, keepdims=True)
+        return residual, step * np.minimum(1.0, largest / length) * self.units
 
     def find_motions(self, q: FloatArray) -> FloatArray:
         """Return rates (j, m) that keep the loops closed at joint values (j,); m is the mobility.
@@ -424,20 +441,6 @@ def _list_limits(graph: JointGraph) -> tuple[FloatArray, FloatArray]:
     return low, high
 
 
-def approach_closure(graph: JointGraph, starts: FloatArray) -> FloatArray:
-    """Return joint values (n, j) near starts (n, j) at which the loops are open the least.
-
-    Directions that hardly change the closures are left out of the steps.
-    """
-    q = starts
-    for _ in range(STARTS):
-        residual, rows = graph.linearize(q)
-        step = -(np.linalg.pinv(rows, rcond=WEAK) @ residual[:, :, None])[:, :, 0]
-        largest = np.abs(step).max(axis=1, initial=1e-300, keepdims=True)
-        q = q + step * np.minimum(1.0, 0.3 / largest) * graph.units
-    return q
-
-
 def measure_gap(graph: JointGraph, placement: Placement, joint: GraphJoint) -> tuple[float, float]:
     """Return the distance [m] and angle [rad] between both sides of a closing joint."""
     A, B = (T[0] for T in graph.locate_ends(placement, joint))
@@ -451,21 +454,21 @@ def measure_gap(graph: JointGraph, placement: Placement, joint: GraphJoint) -> t
     return float(np.linalg.norm(gap)), angle
 
 
-def _can_close(graph: JointGraph, closing: tuple[GraphJoint, ...], starts: FloatArray) -> bool:
-    """Return whether some of the closures close from one of the first starts (n, j)."""
-    return bool(np.isfinite(replace(graph, closing=closing).close(starts[:NEAR])).any())
-
-
 def _describe_gap(graph: JointGraph, starts: FloatArray) -> object:
     """Return the finding of loops that do not close: of the closures without which the others
     close, or else of all, the one that is open the most in the best pose.
     """
-    q = approach_closure(graph, starts)
+    q = graph.approach(starts)
     best = q[[int(np.argmin((graph.linearize(q)[0] ** 2).sum(axis=1)))]]
     placement = graph.place(best)
     few = graph.closing if len(graph.closing) <= FEW else ()
     rest = {joint: tuple(other for other in graph.closing if other is not joint) for joint in few}
-    alone = [joint for joint, others in rest.items() if _can_close(graph, others, starts)]
+    first = starts[:NEAR]
+    alone = [
+        joint
+        for joint, others in rest.items()
+        if np.isfinite(replace(graph, closing=others).close(first)).any()
+    ]
     gaps = [(measure_gap(graph, placement, joint), joint) for joint in alone or graph.closing]
     (gap, angle), joint = max(gaps, key=lambda entry: entry[0][0] / graph.size + entry[0][1])
     return report_finding(
@@ -504,7 +507,7 @@ def repair_rounded_loops(graph: JointGraph, rounding: tuple[float, float]) -> Re
     start = np.zeros((1, len(graph.tree)))
     if limit == 0.0 or _can_move(graph, graph.close(start)[0]):
         return unchanged
-    q = approach_closure(graph, start)[0]
+    q = graph.approach(start)[0]
     if np.abs(graph.linearize(q[None])[0]).max(initial=0.0) > limit:
         return unchanged
     repaired, turn = _align_axes(graph, q, limit)
