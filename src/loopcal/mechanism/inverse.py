@@ -412,7 +412,7 @@ class _Rows:
                 if not len(keep) or count == STEPS:
                     break
                 rows, now = rows.select(keep), now.take(keep)
-                alive, share, before, step = (a[keep] for a in (alive, share, before, step))
+                alive, share, before, step = alive[keep], share[keep], before[keep], step[keep]
             trial = rows.evaluate(now.u + share[:, None] * step, now.loops)
             square = (1.0 + ROUNDED) * now.gap**2 - 2e-4 * share * now.left**2
             better = trial.gap <= np.maximum(np.sqrt(square.clip(min=0.0)), close)
