@@ -74,18 +74,19 @@ def find_impossible_values(
         state = forward_trials(robot, values[None], q)
     if is_closed(state.status).all():
         return ()
-    deviation = np.abs(values - robot.parameters.nominal)
-    largest = int(np.argmax(deviation))
-    unit = robot.get_unit(robot.parameters.dimensions[largest])
+    table = robot.parameters
+    largest = int(np.argmax(np.abs(values - table.nominal)))
+    value, nominal = (
+        robot.to_quantity(float(own[largest]), table.dimensions[largest])
+        for own in (values, table.nominal)
+    )
     gap = float(state.residual[0, 0])
     finding = report_finding(
         "mechanism.values-open-loops",
         gap=Quantity(gap * 1e3, "mm") if np.isfinite(gap) else None,
-        name=robot.parameters.names[largest],
-        value=Quantity(float(values[largest]) / unit.factor_to_si, unit.symbol),
-        nominal=robot.to_quantity(
-            float(robot.parameters.nominal[largest]), robot.parameters.dimensions[largest]
-        ),
+        name=table.names[largest],
+        value=value,
+        nominal=nominal,
     )
     return ((None, finding),)
 

@@ -19,8 +19,8 @@ from loopcal.mechanism.assembly import AXES, FORCES, Actuator, Address, Joint, L
 from loopcal.mechanism.families.placement import (
     AngleTolerance,
     ErrorModel,
-    ErrorTolerances,
     LengthTolerance,
+    LinkTolerances,
     PlacedLimb,
     Point,
     RatioTolerance,
@@ -504,7 +504,7 @@ class PlacedRow:
 
 
 def row_errors(
-    row: PlacedRow, unknown: Iterable[str] | None = None, spread: ErrorTolerances | None = None
+    row: PlacedRow, unknown: Iterable[str] | None = None, spread: LinkTolerances | None = None
 ) -> ErrorModel:
     """Return the unknown terms of a drive or coupling, `q1.offset`, `gear.weight.arm.pin` ..; what
     stands before a point, and `table`, means all of a kind. Raises RecordError for impossible ones.
@@ -539,7 +539,7 @@ def row_errors(
     return join_errors(errors)
 
 
-def complete_row(row: PlacedRow, spread: ErrorTolerances) -> ErrorModel:
+def complete_row(row: PlacedRow, spread: LinkTolerances) -> ErrorModel:
     """Return the offset of a drive or coupling, and those dimensions of a triangle that, with the
     offset, have the effects of all others, as parameters.
 

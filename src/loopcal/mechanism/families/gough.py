@@ -208,7 +208,7 @@ class Gough(RobotRecord):
             freedoms=AXES,
             controlled=("x", "y", "z", "roll", "pitch", "yaw"),
             own=own,
-            complete=LinkTolerances(links, angles).deviations if is_complete else None,
+            complete=LinkTolerances(links, angles) if is_complete else None,
         )
 
     def _check(self) -> None:

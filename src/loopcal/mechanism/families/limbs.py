@@ -300,7 +300,7 @@ class Limbs(RobotRecord):
             errors,
             freedoms=self.freedoms,
             controlled=self.controlled,
-            complete=self.tolerances.deviations if self.error_model == "complete" else None,
+            complete=self.tolerances if self.error_model == "complete" else None,
         )
         bodies = _place_bodies(self, [limb.limb for limb in placed])
         return replace(assembly, closure=self.closure, bodies=bodies)

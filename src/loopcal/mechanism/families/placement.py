@@ -285,17 +285,6 @@ def join_errors(models: Iterable[ErrorModel]) -> ErrorModel:
     )
 
 
-class ErrorTolerances(NamedTuple):
-    """Standard deviations of lengths and angles [m, rad]; None where none is stated."""
-
-    length: float | None = None
-    angle: float | None = None
-
-    def select(self, dimension: Dimension) -> float | None:
-        """Return that of a dimension."""
-        return self.angle if dimension is Dimension.ANGLE else self.length
-
-
 def single_error(
     name: str,
     dimension: Dimension,
@@ -358,7 +347,7 @@ def offset_error(
     return single_error(name, dimension, nominal, tolerance, offset, positive=positive)
 
 
-def complete_errors(limb: PlacedLimb, spread: ErrorTolerances, places_body: bool) -> ErrorModel:
+def complete_errors(limb: PlacedLimb, spread: LinkTolerances, places_body: bool) -> ErrorModel:
     """Return all errors of the links of a limb. Those of an attachment that `places_body` are none:
     they move the frame of the body.
     """
@@ -374,11 +363,13 @@ def complete_errors(limb: PlacedLimb, spread: ErrorTolerances, places_body: bool
         entry = LinearMap(name, Address(limb.name, element, axis))
         errors.append(single_error(name, dimension, 0.0, spread.select(dimension), entry))
     if own.ending == "distance" and not own.actuator:
-        errors.append(rod_length_error(limb, f"{limb.name}.length", spread.length))
+        errors.append(
+            rod_length_error(limb, f"{limb.name}.length", spread.select(Dimension.LENGTH))
+        )
     return join_errors(errors)
 
 
-def complete_limbs(limbs: Sequence[PlacedLimb], spread: ErrorTolerances) -> ErrorModel:
+def complete_limbs(limbs: Sequence[PlacedLimb], spread: LinkTolerances) -> ErrorModel:
     """Return all errors of the links of all limbs."""
     # the first rigid limb of a body places its frame, so that errors of its end are none
     rigid = [limb for limb in limbs[::-1] if limb.limb.ending == "rigid"]
@@ -469,10 +460,8 @@ class LinkTolerances:
     lengths: LengthTolerance | None = None
     angles: AngleTolerance | None = None
 
-    @property
-    def deviations(self) -> ErrorTolerances:
-        """Standard deviations [m, rad]."""
-        return ErrorTolerances(
-            standard_deviation(self.lengths, "the lengths"),
-            standard_deviation(self.angles, "the angles"),
-        )
+    def select(self, dimension: Dimension) -> float | None:
+        """Return the standard deviation of a dimension [m, rad], None where none is stated."""
+        if dimension is Dimension.ANGLE:
+            return standard_deviation(self.angles, "the angles")
+        return standard_deviation(self.lengths, "the lengths")

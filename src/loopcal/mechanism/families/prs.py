@@ -25,7 +25,6 @@ from loopcal.mechanism.families.placement import (
     EY,
     EZ,
     ErrorModel,
-    ErrorTolerances,
     JointPlacement,
     LinkTolerances,
     PlacedLimb,
@@ -121,7 +120,7 @@ def build_pus_limb(name: str, motor: str, frames: ChainFrames, axes: bool) -> Pl
 def carriage_errors(
     limb: PlacedLimb,
     number: int,
-    spread: ErrorTolerances,
+    spread: LinkTolerances,
     *,
     foot: str = "xy",
     guide: str = "xy",
@@ -133,7 +132,7 @@ def carriage_errors(
 
     foot, guide, joint : axes of b, thB and thC. The z coordinate of b has the same effect as q.
     """
-    length, angle = spread.length, spread.angle
+    length, angle = map(spread.select, (Dimension.LENGTH, Dimension.ANGLE))
     errors = [point_errors(f"a{number}", limb, "platform", length)]
     errors.append(point_errors(f"b{number}", limb, "guide", length, foot))
     (motor,), rod = limb.limb.drives, f"l{number}"
@@ -201,7 +200,7 @@ class CarriageRobot(RobotRecord):
     ) -> Assembly:
         """Return limbs under a free platform; errors : of the ideal model."""
         check_spherical(self.name, self.spherical, self.error_model)
-        spread = self.tolerances.deviations if self.error_model == "complete" else None
+        spread = self.tolerances if self.error_model == "complete" else None
         drives = [name for limb in limbs for name in limb.limb.drives]
         return self.assemble(
             limbs,
@@ -231,7 +230,7 @@ class RuPusPrs(CarriageRobot):
     def expand(self) -> Assembly:
         """Return three limbs under a free platform."""
         a, b, axes = self.platform_radius, self.base_radius, self.spherical == "axes"
-        home, spread = self.home.matrix, self.tolerances.deviations
+        home, spread = self.home.matrix, self.tolerances
         first = ChainFrames(translate(-b), translate(-a), self.rod, home)
         second = ChainFrames(translate(0.0, b), translate(0.0, a), self.rod, home)
         # revolute joint, link and universal joint; at home all frames are parallel
@@ -249,12 +248,13 @@ class RuPusPrs(CarriageRobot):
         def list_errors() -> Iterator[ErrorModel]:
             yield carriage_errors(limbs[0], 1, spread)
             yield carriage_errors(limbs[1], 2, spread, joint="yz")
-            of_post = limbs[2], "universal1", "z", spread.length
+            of_post = limbs[2], "universal1", "z", spread.select(Dimension.LENGTH)
             yield displacement_error("r", *of_post, positive=True)
+            angle = spread.select(Dimension.ANGLE)
             left_out = LEFT_OUT if self.parameter_set == "twenty-five" else ()
             for name, element, axis in POST_ANGLES:
                 if name not in left_out:
-                    yield displacement_error(name, limbs[2], element, axis, spread.angle)
+                    yield displacement_error(name, limbs[2], element, axis, angle)
 
         return self.join(limbs, list_errors(), "phi", "theta")
 
@@ -280,7 +280,7 @@ class ThreePrs(CarriageRobot):
         """Return three PRS limbs under a free platform."""
         base, platform = translate(self.base_radius), translate(self.platform_radius)
         turns = [rotate_about(EZ, 2 * np.pi / 3 * k) for k in range(3)]
-        home, axes, spread = self.home.matrix, self.spherical == "axes", self.tolerances.deviations
+        home, axes, spread = self.home.matrix, self.spherical == "axes", self.tolerances
         frames = [ChainFrames(T @ base, T @ platform, self.rod, home) for T in turns]
         limbs = [
             build_prs_limb(f"chain{k}", f"q{k}", own, "y", axes) for k, own in enumerate(frames, 1)

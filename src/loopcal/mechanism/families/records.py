@@ -32,9 +32,9 @@ from loopcal.mechanism.families.drives import (
 from loopcal.mechanism.families.placement import (
     AngleTolerance,
     ErrorModel,
-    ErrorTolerances,
     Freedom,
     LengthTolerance,
+    LinkTolerances,
     PlacedLimb,
     PoseRecord,
     RatioTolerance,
@@ -356,7 +356,7 @@ class RobotRecord:
         freedoms: tuple[str, ...],
         controlled: tuple[str, ...],
         own: Iterable[Actuator] = (),
-        complete: ErrorTolerances | None = None,
+        complete: LinkTolerances | None = None,
     ) -> Assembly:
         """Return the assembly of limbs at the home pose of this record, with the drives and
         parameters that it states.
