@@ -567,6 +567,34 @@ def test_sums_that_do_not_hold_the_platform_are_refused(tmp_path: Path) -> None:
     assert load_text(tmp_path, symmetric).has_open_sums
 
 
+SPLINE = """format: 1
+family: limbs
+name: screw-spline
+units: {length: mm, angle: deg}
+freedoms: [x, y, z, rx, ry, rz]
+controlled: [z, yaw]
+drives:
+  spline: {reads: angle, sum: {t: 1}, unknown: [offset], angle: {sd: 0.1}}
+  nut: {reads: angle, lead: 20, sum: {h: 1}, radius: {t: -3.2}, unknown: [lead, radius], radii: {sd: 0.1}, leads: {sd: 0.1}}
+limbs:
+  - {name: shaft, ending: rigid, chain: [{joint: P, name: slide, actuated: h}, {joint: R, name: turn, actuated: t}], attach: [-40, 0, 0]}
+"""  # noqa: E501
+
+
+def test_a_nut_and_a_spline_move_one_shaft(tmp_path: Path) -> None:
+    """The wrist of a SCARA arm: the nut lifts by its lead, and the spline turns the screw in it."""
+    robot = draw_errors(load_text(tmp_path, SPLINE), 1)
+    value = dict(zip(robot.parameters.names, robot.values, strict=True))
+    assert set(value) == {"spline.offset", "nut.lead", "nut.radius.t"}
+    q = np.random.default_rng(2).uniform(-2, 2, (20, 2))
+    T, turn = forward(robot, q).T, q[:, 0] + value["spline.offset"]
+    rise = value["nut.lead"] * q[:, 1] / (2 * np.pi) - value["nut.radius.t"] * turn
+    assert_allclose(T[:, 2, 3], rise, rtol=0, atol=1e-12)
+    assert_allclose(np.arctan2(T[:, 1, 0], T[:, 0, 0]), turn, rtol=0, atol=1e-12)
+    assert_allclose(inverse(robot, T).q, q, rtol=0, atol=1e-9)
+    check_pose_derivatives(robot, q[None, :3])
+
+
 def test_a_triangle_drive_beside_sums_turns_its_joint(tmp_path: Path) -> None:
     """As many readings as joints, and fewer: then closure determines the joints."""
     anchors = "unknown: [offset, foot.x], length: {sd: 0.1}"

@@ -158,7 +158,17 @@ class Sum:
 
 
 @dataclass(frozen=True, kw_only=True)
-class LengthDrive(Sum, Gain, GivesLength):
+class Radii:
+    """Rotary joints in a sum of lengths: `radius`, joint -> length per radian. Unknown radii have
+    the tolerance `radii`.
+    """
+
+    radius: Mapping[str, Length] = field(default_factory=dict)
+    radii: LengthTolerance | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class LengthDrive(Radii, Sum, Gain, GivesLength):
     """A drive of a slide or rod whose reading is a length."""
 
     reads: Literal["length"]
@@ -196,7 +206,7 @@ class SpoolDrive(Sum, GivesLength):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ScrewDrive(Sum, GivesLength):
+class ScrewDrive(Radii, Sum, GivesLength):
     """A screw whose reading is its angle: it moves by `lead` in one turn, negative for a left-hand
     one, with the tolerance `leads`.
     """
@@ -290,16 +300,14 @@ class AngleCoupling(CouplingRecord):
 
 
 @dataclass(frozen=True, kw_only=True)
-class LengthCoupling(CouplingRecord):
+class LengthCoupling(Radii, CouplingRecord):
     """A coupling of slides, and of rotary joints by a `radius` (joint -> length per radian), as of
     a pinion on a rack. Unknown radii have the tolerance `radii`.
     """
 
     of: Literal["length"]
-    radius: Mapping[str, Length] = field(default_factory=dict)
     length: LengthTolerance | None = None
     slopes: LengthTolerance | None = None
-    radii: LengthTolerance | None = None
 
 
 Coupling = AngleCoupling | LengthCoupling
@@ -360,7 +368,7 @@ def list_parts(stated: Drive | Coupling) -> tuple[SumPart, ...]:
         return ()
     turns, ratio = stated.GIVEN is Dimension.ANGLE, Dimension.RATIO
     parts = (SumPart("weight", stated.sum.items(), turns, ratio, stated.weights),)
-    if isinstance(stated, LengthCoupling):
+    if isinstance(stated, Radii):
         radii = stated.radius.items()
         parts += (SumPart("radius", radii, True, Dimension.LENGTH, stated.radii),)
     return parts
@@ -605,7 +613,7 @@ def place_rows(
                 "conditions",
                 condition,
             )
-    sums = [key for key, drive in stated.items() if getattr(drive, "sum", None)]
+    sums = [key for key in stated if any(part.items for part in list_parts(stated[key]))]
     keys: dict[str, tuple[str | None, Mapping[str, str]]] = {
         name: (key, names)
         for key in sums
@@ -724,7 +732,7 @@ def _name_joints(
                     f"{suggest_names(alias, list(known))}. Write limb.joint or the name of a drive"
                 )
             if joints[known[alias][0]].turns != part.turns:
-                has_radii = isinstance(stated, LengthCoupling)
+                has_radii = isinstance(stated, Radii)
                 remedy = "List it under `radius:`" if has_radii else "Sum joints of one kind"
                 raise refuse(
                     f"adds angles, but {alias!r} slides. Give `of: length` or `reads: length`"
@@ -813,7 +821,9 @@ def _check_drive(placed: PlacedRow, drive: Drive) -> None:
     stated or unknown and cannot be (DriveError).
     """
     name, turns = placed.name, placed.joint.turns
-    if turns != (drive.GIVEN is Dimension.ANGLE or isinstance(drive, TriangleDrive)):
+    if not placed.joints and turns != (
+        drive.GIVEN is Dimension.ANGLE or isinstance(drive, TriangleDrive)
+    ):
         motion, allowed = (
             ("turns", "reads: angle without a radius, or a triangle")
             if turns
