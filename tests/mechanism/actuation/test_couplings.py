@@ -239,7 +239,7 @@ def test_two_fingers_on_one_motor_agree_with_their_drawing(tmp_path: Path) -> No
         (GEARED, "unknown: [offset, weight.motor]", "unknown: [weight.b]", "no term 'weight.b'"),
         (GEARED, "{motor: 2, b.pin: 1}", "{motor: 2, b.pin: .inf}", "b.pin"),
         (GEARED, "gears:", "other: {sum: {motor: 1, b.pin: 1}}\n  gears:", "Leave out"),
-        (TRAIN, "gears:", "other: {sum: {a.pin: 2, b.pin: 2.4}}\n  gears:", "nothing new"),
+        (TRAIN, "gears:", "other: {sum: {a.pin: 2, b.pin: 2.4}}\n  gears:", "follows from"),
         (
             TRAIN,
             "gears:",

@@ -257,7 +257,7 @@ def test_forces_of_a_file_are_read_in_their_units(tmp_path: Path) -> None:
     [
         ("force.x [N],force.z [N]", "1,2", "no column 'force.y'"),
         ("force.x [N],force.y [N],force.z [N]", "1,2,", "column 'force.z' is empty"),
-        ("force.x [N],force.y [N],force.z [mm]", "1,2,3", "unit of length, but a force"),
+        ("force.x [N],force.y [N],force.z [mm]", "1,2,3", "unit of length, not of a force"),
         ("force.x,force.y [N],force.z [N]", "1,2,3", "'force.x' "),
         ("Fx [N],force.y [N],force.z [N]", "1,2,3", "'Fx' is unknown"),
         ("load.q1 [N],force.x [N],force.y [N],force.z [N]", "1,1,2,3", "remove one of the two"),
@@ -286,7 +286,7 @@ def test_a_force_on_a_stiff_robot_is_refused(tmp_path: Path) -> None:
         (NAME, "compliance: 5.0e-5, unknown: [compliance], compliances", "length", "no drive with"),
         (NAME, "force.y:", "force.q:", "Call it temperature"),
         (NAME, "[-3000, 1000]", "[3000, 1000]", "first value must be smaller"),
-        (NAME, ", compliances: {sd: 1.0e-5}", "", "state `compliances:`"),
+        (NAME, ", compliances: {sd: 1.0e-5}", "", "Give `compliances:`"),
         (NAME, "compliance: 5.0e-5", "compliance: -5.0e-5", "negative"),
     ],
 )

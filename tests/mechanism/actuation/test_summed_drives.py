@@ -513,7 +513,7 @@ SECOND, THIRD = "q2: {reads: length, sum: {m: 1, k: 2}}", "q3: {reads: length, s
         (SECOND, "q2: {reads: length, sum: {m: 1, kk: 2}}", "names 'kk', which is neither", 9),
         (SECOND, "q2: {reads: length, sum: {m: 1, h: 2}}", "'k' of limb 'K' is in no sum", 8),
         (SECOND, "q2: {reads: length, sum: {m: 2, n: 2}}\n  k: {reads: length}",
-         "singular: that of actuator 'q2' follows", 9),
+         "singular: the sum of actuator 'q2' follows", 9),
         (SECOND, "q2: {reads: length, sum: {m: 0, k: 0}}", "no weight other than 0", 9),
         (SECOND, "q2: {reads: length, sum: {m: 1, k: .inf}}", "is inf. Write a finite number", 9),
         (SECOND, "q2: {reads: length, sum: [m, k]}",
@@ -593,6 +593,23 @@ def test_a_nut_and_a_spline_move_one_shaft(tmp_path: Path) -> None:
     assert_allclose(np.arctan2(T[:, 1, 0], T[:, 0, 0]), turn, rtol=0, atol=1e-12)
     assert_allclose(inverse(robot, T).q, q, rtol=0, atol=1e-9)
     check_pose_derivatives(robot, q[None, :3])
+
+
+def test_a_sum_over_copied_limbs_is_one_for_each_copy(tmp_path: Path) -> None:
+    text = (
+        PLATE[: PLATE.index("actuators:")]
+        + """drives:
+  q: {reads: length, sum: {m: 1, n: 0.2}, unknown: [weight.n], weights: {sd: 0.001}}
+limbs:
+"""
+    )
+    for name, y, end in (("m", 800, "[-150, -100, 0]"), ("n", -800, "[150, 300, 0]")):
+        text += f"  - {{name: {name.upper()}, tip: [-1000, {y}, 0], ending: distance, "
+        text += f"attach: {end}, actuated: {name}, copies: {{count: 3}}}}\n"
+    robot = load_text(tmp_path, text)
+    assert robot.parameters.names == ("q1.weight.n", "q2.weight.n", "q3.weight.n")
+    sums = [(a.name, *a.weights) for a in robot.actuators]
+    assert sums == [(f"q{i}", f"m{i}", f"n{i}") for i in (1, 2, 3)]
 
 
 def test_a_triangle_drive_beside_sums_turns_its_joint(tmp_path: Path) -> None:
