@@ -6,11 +6,14 @@ A controller adds a correction c that it interpolates linearly between nodes:
     commands   x + c(x) in place of the coordinates x
     height     z + c(x, y) in place of z, at the lowest z of the workspace
     readings   q_i + c_i(q_i) in place of the reading of actuator i
+    skew       U^-1 x in place of x, with a unit upper triangle U, and axes that are scaled by s
 
 At the nodes of the first two, FK(IK(x + c; controller); identified) = x. A reading needs a
 correction that depends on all coordinates, except for errors of its own drive: the table of an
 actuator is the least-squares fit to IK(x; identified) - IK(x; controller) over the workspace. What
-remains is the error of the identified machine at other points.
+remains is the error of the identified machine at other points. Skew: positions of the machine are
+R U diag(s) x + b with a rotation R, by least squares; what remains is that after the best rigid
+motion, because such a controller turns no frame.
 """
 
 from __future__ import annotations
@@ -23,7 +26,7 @@ import numpy as np
 
 from loopcal.errors import DataError
 from loopcal.findings import Finding, Severity, report_finding
-from loopcal.geometry import wrap_angle
+from loopcal.geometry import align_point_sets, wrap_angle
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import POSITION, TILT, get_dimension, read_coordinates
 from loopcal.mechanism.solutions import forward, inverse, list_commanded
@@ -31,7 +34,7 @@ from loopcal.mechanism.workspace import draw_coordinates, sample_workspace, work
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension
 
-What = Literal["commands", "height", "readings"]
+What = Literal["commands", "height", "readings", "skew"]
 
 SHARE = 0.1  # of the largest error, which remains where nobody states another limit
 STEPS = 5  # of the fixed-point iteration: each leaves the slope of the map, far below 1
@@ -112,7 +115,7 @@ def make_tables(
     names, reason = robot.controlled, ""
     if set(names) & set(TILT):
         reason = "tilt"
-    elif size.what == "height" and not {"x", "y", "z"} <= set(names):
+    elif size.what in ("height", "skew") and names[:3] != ("x", "y", "z"):
         reason = "height"
     elif controller.controlled != names or len(controller.actuators) != len(robot.actuators):
         reason = "other"
@@ -139,10 +142,13 @@ def make_tables(
         targets = place(draw_coordinates(np.random.default_rng(0), tuple(axes), ranges, CHECKS))
     before = machine.lead(targets, targets)
     targets, before = (rows[np.isfinite(before).all(axis=1)] for rows in (targets, before))
+    tables, after = list[CorrectionTable](), before
+    if size.what == "skew":
+        tables, before, after = _fit_skew(machine, targets, before)
     limit = SHARE * machine.weigh(before) if limit is None else limit
     if size.what == "readings":
         tables, after = _fit_readings(machine, targets, limit, size.most_along)
-    else:
+    elif size.what != "skew":
         spans = [ranges[name] for name in axes]
         nodes, grid, after = _choose_grid(machine, place, targets[:, places], spans, limit, size)
         values = dict(zip(moved, np.moveaxis(grid, -1, 0), strict=True))
@@ -168,7 +174,7 @@ def _report(
     sizes = [machine.measure(rows, machine.corrected) for rows in misses]
     sizes.append((limit, limit / robot.size if sizes[0][1] else 0.0))
     data: dict[str, Any] = {"what": size.what, "points": len(misses[1]), "is_met": is_met}
-    data["nodes"] = [" x ".join(str(len(n)) for n in table.axes.values()) for table in tables]
+    data["nodes"] = [" x ".join(str(len(n)) for n in t.axes.values()) for t in tables if t.axes]
     for key, (position, angle) in zip(("before", "after", "limit"), sizes, strict=True):
         data[key] = robot.to_quantity(position, Dimension.LENGTH)
         data[f"angle_{key}"] = robot.to_quantity(angle, Dimension.ANGLE) if angle else 0
@@ -241,6 +247,26 @@ def _choose_grid(
         if (wanted == counts).all():
             return nodes, grid, after
         counts = wanted
+
+
+def _fit_skew(
+    machine: _Machine, targets: FloatArray, before: FloatArray
+) -> tuple[list[CorrectionTable], FloatArray, FloatArray]:
+    """Return skews and scales, errors at targets (n, c), and what remains of them."""
+    A = np.linalg.lstsq(*(x - x.mean(axis=0) for x in (targets, targets + before)), rcond=None)[0].T
+    T = np.linalg.qr(A)[1]
+    T *= np.sign(np.diag(T))[:, None]
+    scale, U = np.diag(T).copy(), T / np.diag(T)
+    if any(actuator.weights for actuator in machine.controller.actuators):
+        scale[:2] = scale[:2].mean()  # both belts drive x and y
+    after = machine.lead(targets, np.linalg.solve(U, targets.T).T / scale)
+    usable = np.isfinite(after).all(axis=1)
+    aligned = []
+    for misses in (before[usable], after[usable]):
+        M = align_point_sets(targets[usable] + misses, targets[usable])
+        aligned.append((targets[usable] + misses) @ M[:3, :3].T + M[:3, 3] - targets[usable])
+    values = {"xy": U[0, 1], "xz": U[0, 2], "yz": U[1, 2], **dict(zip("xyz", scale, strict=True))}
+    return [CorrectionTable({}, values)], *aligned
 
 
 def _fit_readings(

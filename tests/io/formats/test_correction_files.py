@@ -4,6 +4,7 @@
 import csv
 import io
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ import loopcal as lc
 from loopcal.apply.correction_tables import TableSize, make_tables
 from loopcal.cli.entry_point import main
 from loopcal.documents import list_controllers
+from loopcal.geometry import align_point_sets
 from loopcal.io.formats import FORMATS
 from loopcal.io.formats.program_format import Exported, ExportSource
 from tests.apply.test_correction_tables import disturb
@@ -67,6 +69,36 @@ def test_klipper_with_the_mesh_prints_flat(tmp_path, machine: Pair, points) -> N
     commands = points + heights[:, None] * [0, 0, 1]
     assert np.abs(move(*machine, commands)[:, 2]).max() * MM < LIMIT + WRITTEN
     assert np.abs(move(*machine, points)[:, 2]).max() > 0.1
+
+
+@pytest.mark.slow
+def test_klipper_with_the_skew_of_a_corexy_prints_true(tmp_path) -> None:
+    """Tilted slides and a wrong rotation distance of both belts and of the lift."""
+    install()
+    controller = lc.load_robot("core-xy")
+    errors = {"gantry.x.rz": 4e-3, "gantry.z.rx": -3e-3, "gantry.z.ry": 2e-3, "z.gain": 2e-3}
+    errors |= {f"{belt}.radius": 1e-5 for belt in "ab"}
+    names = controller.parameters.names
+    truth = controller.with_values(controller.values + [errors.get(name, 0.0) for name in names])
+    exported = export(truth, controller, "klipper-skew").text
+    config = tmp_path / "printer.cfg"
+    config.write_text("[printer]\nkinematics: corexy\n[skew_correction]\n" + exported)
+    from klippy.extras.skew_correction import PrinterSkew  # type: ignore[import-not-found]
+
+    skew = PrinterSkew(Printer(config).config.getsection("skew_correction"))
+    skew.cmd_SKEW_PROFILE(SimpleNamespace(get={"LOAD": "loopcal"}.get))
+    scales = [float(line.split()[-1].rstrip(".")) for line in exported.splitlines()[1:4]]
+    points = np.random.default_rng(4).uniform([-100, -100, 10], [100, 100, 200], (50, 3))
+    moved = np.array([skew.calc_skew([*point, 0.0])[:3] for point in points.tolist()])
+    # a motor turns less by the factor of its rotation distance
+    errors_left = []
+    for commands in (points, moved / scales):
+        reached = move(truth, controller, commands)
+        M = align_point_sets(reached, points)
+        errors_left.append(np.abs(reached @ M[:3, :3].T + M[:3, 3] - points).max())
+    assert errors_left[0] > 0.2  # [mm]
+    # [mm] x and y share a scale, and (4 mrad)^2 / 4 of 100 mm remain in each
+    assert errors_left[1] < 5e-4
 
 
 def test_reprapfirmware_with_the_height_map_prints_flat(machine: Pair, points) -> None:

@@ -31,6 +31,7 @@ FORMATS: Registry[Format] = Registry(
         "c": "loopcal.io.formats.c_kinematics:FORMAT",
         "grid": "loopcal.io.formats.correction_files:GRID",
         "grid-klipper": "loopcal.io.formats.correction_files:KLIPPER",
+        "klipper-skew": "loopcal.io.formats.correction_files:SKEW",
         "grid-reprap": "loopcal.io.formats.correction_files:REPRAP",
         "grid-linuxcnc": "loopcal.io.formats.correction_files:COMPENSATION",
         "json": "loopcal.io.formats.import_export:JSON",

@@ -125,6 +125,19 @@ def write_compensation(source: ExportSource, into: Path | None) -> Exported:
     return Exported("\n".join(lines) + "\n", notes, files)
 
 
+def write_skew(source: ExportSource, into: Path | None) -> Exported:
+    """Return a profile of Klipper's [skew_correction], and factors of rotation_distance."""
+    del into
+    values = {name: float(value) for name, value in source.tables[0].values.items()}
+    lines = [
+        f"# Add [skew_correction] to printer.cfg, and load this by SKEW_PROFILE LOAD={PROFILE}."
+    ]
+    lines += [f"# Multiply rotation_distance of [stepper_{n}] by {values[n]:.9f}." for n in "xyz"]
+    lines += [f"[skew_correction {PROFILE}]"]
+    lines += [f"{plane}_skew: {values[plane]:.9f}" for plane in ("xy", "xz", "yz")]
+    return Exported("\n".join(lines) + "\n")
+
+
 def _describe(name: str, what: str, write: Writer, table: tuple[What, int, int]) -> Format:
     """Return the format of a table."""
     return Format(name, what, (), None, write, takes_file=False, table=table)
@@ -132,6 +145,7 @@ def _describe(name: str, what: str, write: Writer, table: tuple[What, int, int])
 
 GRID = _describe("grid", "corrections over a grid, as CSV", write_grid, ("commands", 20000, 500))
 KLIPPER = _describe("grid-klipper", "height map of Klipper", write_mesh, ("height", 10000, 99))
+SKEW = _describe("klipper-skew", "[skew_correction] of Klipper", write_skew, ("skew", 0, 0))
 REPRAP = _describe("grid-reprap", "heightmap.csv", write_height_map, ("height", 441, 41))
 COMPENSATION = _describe(
     "grid-linuxcnc", "LinuxCNC COMP_FILE", write_compensation, ("readings", 256, 256)
