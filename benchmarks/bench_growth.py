@@ -34,10 +34,9 @@ LIMIT = 5.0
 compares each row with all others grows sixteenfold.
 """
 
-SETUP_LIMIT = 8.0
-"""The same for setup parameters [processor time]: a part still compares wrong blocks, and lists
-rows, by the setup parameters of all sessions and targets. What decomposes all of them grows
-64-fold.
+SETUP_LIMIT = 4.5
+"""The same for setup parameters [processor time]. What decomposes those of all sessions or targets
+grows 64-fold.
 """
 
 

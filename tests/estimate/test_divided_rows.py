@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -17,7 +19,7 @@ from loopcal.estimate.observation_rows import ObservationRows
 from loopcal.geometry import exp_so3, make_pose
 from loopcal.io.robot.robot_file import load_robot
 from loopcal.measure.kinds.distance import Distance, Separation
-from loopcal.measure.kinds.position import Bearing, Position
+from loopcal.measure.kinds.position import Bearing, Position, TargetKind
 from loopcal.measure.kinds.surfaces import Plane, Sphere
 
 NAMES, PLACES = ("a", "b", "c"), np.array([[0.1, 0.0, 0.02], [-0.05, 0.08, 0.02], [0.0, -0.1, 0.0]])
@@ -35,7 +37,7 @@ KINDS = [
 
 
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: f"{kind.name}-{'-'.join(kind.unknown)}")
-def test_rows_of_one_target_are_those_of_all(kind) -> None:
+def test_rows_of_one_target_are_those_of_all(kind, monkeypatch) -> None:
     rng, links = np.random.default_rng(1), kind.poses_per_row
     T = np.array([make_pose(exp_so3(w), 0.1 * w) for w in rng.normal(0.0, 0.3, (4 * links, 3))])
     c, m, u = len(kind.columns), len(kind.noise_columns), len(kind.nuisance_parameters)
@@ -47,13 +49,19 @@ def test_rows_of_one_target_are_those_of_all(kind) -> None:
     whole = ObservationRows(kind, poses, measured, white, used)
     parts = whole.divided()
     assert len(parts.poses) == 12
-    at = kind.evaluate(T[None, poses], measured, values[:, None])
+    joined = kind.evaluate(T[None, poses], measured, values[:, None])
     own = parts.kind.evaluate(T[None, parts.poses], parts.measured, values[:, parts.nuisance])
-    assert_allclose(own.residual.reshape(1, 4, m), at.residual, atol=1e-14)
+    monkeypatch.setattr(TargetKind, "divided", None)
+    at = replace(kind).evaluate(T[None, poses], measured, values[:, None])
+    assert own.nuisance is not None
+    assert at.nuisance is not None
+    for one, other in zip(joined[:3], at[:3], strict=True):
+        assert_allclose(one, other, atol=1e-14)
     wide = np.zeros((1, 12, m // 3, u))
     places = np.broadcast_to(parts.nuisance[:, None], own.nuisance.shape)
     np.put_along_axis(wide, places, own.nuisance, axis=3)
     assert_allclose(wide.reshape(1, 4, m, u), at.nuisance, atol=1e-14)
+    assert_allclose(own.residual.reshape(1, 4, m), at.residual, atol=1e-14)
     assert_allclose(
         np.einsum("trii->tri", parts.whitener).reshape(1, 4, m), np.einsum("trii->tri", white)
     )

@@ -87,8 +87,8 @@ def list_observed_values(linear: FitLinearization, clusters: Clusters) -> Observ
             place, column = np.nonzero(rows.is_present[0])
             if not len(place):
                 continue
-            row, columns = block.locate(i, place)
-            component = columns[np.arange(len(place)), column]
+            row, of_row = block.locate(i, place)
+            component = of_row[np.arange(len(place)), column]
             own = linearize_rows(rows, poses, trials, fixed)
             by_parameters = own.by_parameters[0]
             by_nuisance = np.zeros((*by_parameters.shape[:2], len(root)))

@@ -28,7 +28,6 @@ from loopcal.numerics.elimination import (
     TreeElimination,
     build_tree,
     eliminate_tree,
-    fold_at,
 )
 from loopcal.numerics.statistics import find_distinct
 from loopcal.numerics.trial_batch import TrialBatch
@@ -245,43 +244,11 @@ def fold_node_rows(
     for structure in sorted({part.structure for part in node_rows if part.structure >= 0}):
         rows, places = [], []
         for part in (part for part in node_rows if part.structure == structure):
-            own = factors.tree.place[part.nodes]
-            width, nodes = factors.tree.structures[structure].width, find_distinct(own)
-            shorter = fold_components(part.rows, width, np.searchsorted(nodes, own), len(nodes))
-            if shorter is None:
-                places.append(np.repeat(own, part.rows.shape[2]))
-                rows.append(_flat(part))
-            else:
-                rows.append(shorter)
-                places.append(np.repeat(nodes, shorter.shape[1] // len(nodes)))
-        factors.add(structure, np.concatenate(rows, axis=1), np.concatenate(places))
+            places.append(np.repeat(factors.tree.place[part.nodes], part.rows.shape[2]))
+            rows.append(_flat(part))
+        together = rows[0] if len(rows) == 1 else np.concatenate(rows, axis=1)
+        factors.add(structure, together, np.concatenate(places))
     return factor
-
-
-def fold_components(rows: FloatArray, width: int, nodes: IntArray, count: int) -> FloatArray | None:
-    """Return rows (a, count k', w) that stand for rows (a, k, m, w) of nodes (k,), those of each
-    node together, where components use few of the first `width` columns, such as those of one
-    of many targets; None where this would not halve the work.
-
-    Components that use the same columns are folded by these alone, all groups of them together.
-    """
-    a, k, m, w = rows.shape
-    used, group = np.unique(rows[..., :width].any(axis=(0, 1)), axis=0, return_inverse=True)
-    g, narrow = len(used), int(used.sum(axis=1).max(initial=0)) + w - width
-    whole = k * m * w**2
-    if 2 * (k * m * narrow**2 + count * g * narrow * w**2) > whole:
-        return None
-    # the columns of each group, the first unused ones in place of missing ones, then the others
-    columns = np.argsort(~used, axis=1, kind="stable")[:, : narrow - w + width]
-    columns = np.concatenate([columns, np.tile(np.arange(width, w), (g, 1))], axis=1)
-    own = np.take_along_axis(rows, columns[group.ravel()][None, None], axis=3)
-    places = (nodes[:, None] * g + group.ravel()).ravel()
-    triangles = fold_at(np.zeros((a, count * g, 0, narrow)), own.reshape(a, k * m, narrow), places)
-    height = triangles.shape[2]
-    spread = np.zeros((a, count * g, height, w))
-    of_each = np.broadcast_to(np.tile(columns, (count, 1))[None, :, None], triangles.shape)
-    np.put_along_axis(spread, of_each, triangles, axis=3)
-    return spread.reshape(a, count * g * height, w)
 
 
 def _flat(part: NodeRows) -> FloatArray:

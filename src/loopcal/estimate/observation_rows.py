@@ -75,7 +75,7 @@ class ObservationRows:
         """Return the rows of each target on its own, (r k, ..), where the noise allows it: they
         move their own place and what all share, and no other target.
         """
-        if (done := self.kind.divide()) is None or self.kind.is_of_base:
+        if (done := self.kind.divided) is None or self.kind.is_of_base:
             return self
         (kind, places), (t, r, m) = done, self.whitener.shape[:3]
         k = len(places)
@@ -100,7 +100,7 @@ class ObservationRows:
         """Return the nuisance parameters that only the rows of one target use, where rows are
         `divided`.
         """
-        done = self.kind.divide()
+        done = self.kind.divided
         if done is None or self.divided() is self:
             return np.zeros(0, dtype=np.int64)
         own = done[1][:, (done[1] != done[1][:1]).any(axis=0)]

@@ -22,7 +22,7 @@ from loopcal.measure.kinds.position import Position
 from loopcal.measure.kinds.setup_parameters import shorten_rotations
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.nuisance import NuisanceParameters
-from loopcal.measure.observations import Observations
+from loopcal.measure.observations import Observations, whiten_columns
 from loopcal.numerics.elimination import find_connected_groups
 from loopcal.numerics.gauss_newton import STEPS, minimize_from_starts, sum_squares
 from loopcal.numerics.statistics import choose_evenly, find_distinct
@@ -120,7 +120,7 @@ def whiten_rows(
                 machine = machine + rows.joints[..., j, None] * by_machine
         blocks = (machine, rows.nuisance, rows.residual[..., None])
         raw = np.concatenate([np.broadcast_to(b, (t, *b.shape[1:])) for b in blocks], axis=-1)
-        white = rows.whitener @ raw
+        white = whiten_columns(rows.whitener, raw)
         whitened.append(white.reshape(t, -1, white.shape[-1]))
     return np.concatenate(whitened, axis=1)
 
@@ -341,8 +341,8 @@ def _refine_candidates(
         c, m = len(x), evaluated.residual.shape[2]
         by_nuisance = evaluated.nuisance
         slopes = np.zeros((1, 1, 1, x.shape[1])) if by_nuisance is None else by_nuisance
-        J = white @ np.broadcast_to(slopes, (c, r, m, x.shape[1]))
-        e = (white @ np.broadcast_to(evaluated.residual, (c, r, m))[..., None])[..., 0]
+        J = whiten_columns(white, np.broadcast_to(slopes, (c, r, m, x.shape[1])))
+        e = whiten_columns(white, np.broadcast_to(evaluated.residual, (c, r, m))[..., None])
         return e.reshape(c, -1), np.where(kept, 0.0, J).reshape(c, r * m, -1)
 
     sets = np.repeat(np.arange(t * g), k)

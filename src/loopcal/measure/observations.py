@@ -70,6 +70,16 @@ class NoisePart(NamedTuple):
     size: StatedSize | None = None  # as stated, where one number states it
 
 
+def whiten_columns(whitener: FloatArray, columns: FloatArray) -> FloatArray:
+    """Return whitened columns (.., m, c) of whiteners (.., m, m); residuals without common errors
+    are scaled, which takes no product of matrices.
+    """
+    scale = np.einsum("...mm->...m", whitener)
+    if np.count_nonzero(scale) < np.count_nonzero(whitener):
+        return whitener @ columns
+    return scale[..., None] * columns
+
+
 def compute_whitener(covariance: FloatArray, present: BoolArray, weight: FloatArray) -> FloatArray:
     """Return matrices W (r, m, m) with `W C W' = weight` on the present components, zero elsewhere.
 

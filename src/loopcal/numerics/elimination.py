@@ -523,12 +523,43 @@ def _carry_inwards(
     return carried, clusters
 
 
+FOLDED = 2_000_000
+"""Numbers that are decomposed together, about: more of them take memory and save no time."""
+
+
 def fold_at(factor: FloatArray, rows: FloatArray, places: IntArray) -> FloatArray:
     """Return factors (a, n, h, w) with rows (a, k, w) folded in at places (k,)."""
     used = factor.shape[2]
     out = _with_height(factor, max(used, _folded_height(factor, used, places)))
     _fold_in_place(out, used, rows, places)
     return out
+
+
+def shorten_rows(rows: FloatArray, width: int) -> FloatArray:
+    """Return fewer rows (a, k, w) of the same triangular factor as rows (a, M, w), where they use
+    few of the first `width` columns, such as those of one of many targets; rows that use the same
+    columns are folded by these alone. The rows as they are where this would not halve the work.
+    """
+    a, M, w = rows.shape
+    is_used = rows[..., :width].any(axis=0)
+    key = is_used @ np.random.default_rng(0).integers(1, 2**40, width)
+    group = np.unique(key, return_inverse=True)[1]
+    g = int(group.max(initial=0)) + 1
+    used = np.zeros((g, width), dtype=bool)
+    np.logical_or.at(used, group, is_used)
+    narrow = int(used.sum(axis=1).max(initial=0)) + w - width
+    if 2 * (M * narrow**2 + g * narrow * w**2) > M * w**2:
+        return rows
+    # the columns of each group, the first unused ones in place of missing ones, then the others
+    columns = np.argsort(~used, axis=1, kind="stable")[:, : narrow - w + width]
+    columns = np.concatenate([columns, np.tile(np.arange(width, w), (g, 1))], axis=1)
+    own = np.take_along_axis(rows, columns[group][None], axis=2)
+    triangles = fold_at(np.zeros((a, g, 0, narrow)), own, group)
+    spread = np.zeros((a, g, triangles.shape[2], w))
+    np.put_along_axis(
+        spread, np.broadcast_to(columns[None, :, None], triangles.shape), triangles, 3
+    )
+    return spread.reshape(a, -1, w)
 
 
 def _folded_height(factor: FloatArray, used: int, places: IntArray) -> int:
@@ -556,15 +587,17 @@ def _fold_in_place(out: FloatArray, used: int, rows: FloatArray, places: IntArra
     within[order] = np.arange(len(places)) - np.repeat(np.cumsum(count) - count, count)
     size = np.where(count > 0, np.ceil(np.log2(np.maximum(count, 1))), -1)
     for alike in find_distinct(size[size >= 0]):
-        chosen = np.flatnonzero(size == alike)
-        index = np.full(n, -1)
-        index[chosen] = np.arange(len(chosen))
-        mine = np.flatnonzero(index[places] >= 0)
-        stacked = np.zeros((a, len(chosen), used + int(count[chosen].max()), w))
-        stacked[:, :, :used] = out[:, chosen, :used]
-        stacked[:, index[places[mine]], used + within[mine]] = rows[:, mine]
-        triangle = np.asarray(np.linalg.qr(stacked, mode="r"))
-        out[:, chosen, : triangle.shape[2]] = triangle
+        nodes = np.flatnonzero(size == alike)
+        height = used + int(count[nodes].max())
+        for chosen in np.array_split(nodes, -(-len(nodes) * height * w * a // FOLDED)):
+            index = np.full(n, -1)
+            index[chosen] = np.arange(len(chosen))
+            mine = np.flatnonzero(index[places] >= 0)
+            stacked = np.zeros((a, len(chosen), height, w))
+            stacked[:, :, :used] = out[:, chosen, :used]
+            stacked[:, index[places[mine]], used + within[mine]] = rows[:, mine]
+            triangle = np.asarray(np.linalg.qr(stacked, mode="r"))
+            out[:, chosen, : triangle.shape[2]] = triangle
 
 
 # Derivatives that are nothing but rounding.

@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from loopcal.numerics.elimination import shorten_rows
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
 ROUNDING = 1e-12
@@ -181,7 +182,8 @@ def _damp_step(
     # one triangular factor, so that the decomposition does not grow with the rows
     columns = jacobian / scale[:, None, :]
     stack = np.nan_to_num(np.concatenate([columns, residual[..., None]], axis=-1))
-    R = np.asarray(np.linalg.qr(stack, mode="r"), dtype=float)
+    shorter = shorten_rows(stack, jacobian.shape[2])
+    R = np.asarray(np.linalg.qr(shorter, mode="r"), dtype=float)
     U, s, V = np.linalg.svd(R[..., :-1], full_matrices=False)
     right = np.einsum("cmk,cm->ck", U, R[..., -1])
     total = s * s + damping[:, None] ** 2 + SMALLEST**2

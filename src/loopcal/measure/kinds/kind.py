@@ -414,9 +414,10 @@ class Kind(ABC):
         """The u parameters of all unknown items; rows of one scope share a value."""
         return tuple(p for item in self.setup_items.values() for p in item.parameters)
 
-    def divide(self) -> tuple[Kind, IntArray] | None:
-        """Return the kind of the rows of one target, and the places (k, u') of its nuisance
-        parameters for each of k targets; None where rows are not divided.
+    @cached_property
+    def divided(self) -> tuple[Kind, IntArray] | None:
+        """The kind of the rows of one target, and the places (k, u') of its nuisance parameters for
+        each of k targets; None where rows are not divided.
         """
         return None
 
@@ -601,6 +602,8 @@ class Kind(ABC):
         if not isinstance(measured, MeasuredColumns):
             measured = self.prepare_columns(measured)
         values = self.nominal_values[None, None] if nuisance is None else nuisance
+        if self.divided is not None:
+            return self._join_targets(*self.divided, T, measured, values, joints)
         T = self._find_platform(T, joints)
         if len(values) > len(T):
             T = np.broadcast_to(T, (len(values), *T.shape[1:]))
@@ -631,6 +634,46 @@ class Kind(ABC):
         residual = np.where(measured.present, result.residual, 0.0)
         jacobian = np.where(by_twist, result.jacobian, 0.0)
         return Evaluation(residual, jacobian, by_nuisance, by_joints)
+
+    def _join_targets(
+        self,
+        kind: Kind,
+        places: IntArray,
+        T: FloatArray,
+        measured: MeasuredColumns,
+        values: FloatArray,
+        joints: FloatArray,
+    ) -> Evaluation:
+        """Return `evaluate` from rows of one target each, of a kind and with parameters at places
+        (k, u') of all: work on no derivative that is zero.
+        """
+        k, (t, r, c), u = len(places), measured.columns.shape, values.shape[-1]
+        columns = measured.columns.reshape(t, r * k, c // k)
+        present = measured.present.reshape(len(measured.present), r * k, -1)
+        reference = kind._compute_reference(columns)
+        own = values[..., places]
+        own = np.broadcast_to(own, (len(own), r, *own.shape[2:])).reshape(len(own), r * k, -1)
+        T, joints = (
+            x.repeat(k if x.shape[1] > 1 or r == 1 else r * k, axis=1) for x in (T, joints)
+        )
+        each = MeasuredColumns(columns, reference, present, measured.is_complete)
+        residual, jacobian, by_own, by_joints = kind.evaluate(T, each, own, joints)
+        t, m = len(residual), residual.shape[2]
+        by_pose = jacobian.reshape(len(jacobian), r, k, *jacobian.shape[2:])
+        by_pose = np.moveaxis(by_pose, 2, -3).reshape(
+            len(by_pose), r, *jacobian.shape[2:-2], k * m, 6
+        )
+        wide = np.zeros((t, r, k, m, u))
+        if by_own is not None:
+            at = np.broadcast_to(places[:, None], (t, r, k, m, places.shape[1]))
+            np.put_along_axis(
+                wide, at, np.broadcast_to(by_own, (t, *by_own.shape[1:])).reshape(at.shape), 4
+            )
+        if by_joints is not None:
+            by_joints = by_joints.reshape(len(by_joints), r, k * m, -1)
+        return Evaluation(
+            residual.reshape(t, r, k * m), by_pose, wide.reshape(t, r, k * m, u), by_joints
+        )
 
     def _find_platform(self, T: FloatArray, joints: FloatArray) -> FloatArray:
         """Return the measured bodies (.., 4, 4): end platforms T, those of a stage, or the base."""

@@ -145,9 +145,10 @@ class TargetKind(Kind):
             ),
         }
 
-    def divide(self) -> tuple[Kind, IntArray] | None:
-        """Return the kind of one unknown target: its place is a parameter, so that one kind stands
-        for all.
+    @cached_property
+    def divided(self) -> tuple[Kind, IntArray] | None:
+        """The kind of one unknown target: its place is a parameter, so that one kind stands for
+        all.
         """
         if self.places is None or len(self.targets) == 1 or "targets" not in self.unknown:
             return None
