@@ -194,7 +194,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             if isinstance(command, click.Group) and len(words) > 1:
                 command = command.commands.get(words[1], command)
             if command is not None and not _has_working_folder():
-                sentence = "there is no working folder. Change to a folder that exists."
+                sentence = "the working folder has disappeared. Change to a folder that exists."
                 return _refuse(sentence, words)
             code = command_line.main(words, "loopcal", standalone_mode=False, obj=words)
             terminal.flush_output()

@@ -731,8 +731,8 @@ and correlation up to which there is none [1].
 """
 
 ADDED = """\
-# Add one row for each pose below: its name, readings and measured values. Leave empty what was not
-# measured.
+# Add one row for each pose below: its name, readings and measured values. Leave unmeasured
+# cells empty.
 # Optional setting for traceability: instrument: {name: .., serial_number: "..", certificate: "..",
 #   laboratory: .., standard: .., calibrated: 2026-01-31, due: 2027-01-31, measured: 2026-05-31}
 # Optional columns: block, session, group, time, temperature [degC], sigma.NAME, note; see
