@@ -10,6 +10,8 @@ from .apply.accuracy import simulate_accuracy as simulate_accuracy
 from .apply.calibration import calibrate as calibrate
 from .apply.calibration_options import CalibrationOptions as CalibrationOptions
 from .apply.calibration_report import CalibrationReport as CalibrationReport
+from .apply.check_up import CheckUp as CheckUp
+from .apply.check_up import check_up as check_up
 from .apply.compensation import Compensation as Compensation
 from .apply.compensation import compensate as compensate
 from .apply.conformity import Conformity as Conformity

@@ -9,9 +9,11 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from loopcal.cli.entry_point import main
+from loopcal.studies.files.store import StoreHeader, make_store, open_store
 
 TARGETS = "pose,x [mm],y [mm]\na,0,330\nb,10,320\n"
 SHORT = """\
@@ -188,3 +190,11 @@ def test_files_and_pages_of_all_commands_are_identical_in_any_environment(tmp_pa
             tmp_path / str(i), commands, {**variables, "LOCPATH": str(tmp_path / "locales")}
         )
         assert list_differences(first, again) == [], name
+
+
+def test_a_study_counts_its_blocks_in_every_locale(locale_of_program, tmp_path) -> None:
+    make_store(tmp_path, StoreHeader("{}", ("error",), {}))
+    with open_store(tmp_path) as store:
+        assert store.add_block("key", {"noise": "1"}, 0, np.zeros((2, 1)), 0.1)
+        assert not store.add_block("key", {"noise": "1"}, 0, np.zeros((2, 1)), 0.1)
+        assert store.count_cell({"noise": "1"}).blocks == 1

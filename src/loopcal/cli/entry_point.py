@@ -63,6 +63,7 @@ SECTIONS = {
             "calibration",
             "Compare calibrations side by side: has the machine changed, and in which part?",
         ),
+        "check-up": ("calibration", "Test by a few poses whether a machine has changed."),
         "certificate": ("calibration", "Print a digital calibration certificate of a calibration."),
         "compensate": ("calibration", "Compute readings or commands that reach targets."),
         "regularize": (

@@ -309,15 +309,29 @@ class ParameterChanges:
         """
         if not self.degrees:
             return float("nan")
-        every = list(range(len(self.names)))
-        kinds = [[every], list(self.group_limbs().values()), [[i] for i in every]]
-        causes = [(self.find_span(p), len(kinds) * len(kind)) for kind in kinds for p in kind]
         random = make_random_stream(0, 0)
         u = np.vstack([self.value, random.standard_normal((DRAWS, self.degrees))])
         sizes = np.ones((len(self.errors), len(u)))  # of the estimated variances, over the true
         for size, error in zip(sizes, self.errors, strict=True):
             if np.isfinite(error.degrees):
                 size[1:] = random.chisquare(error.degrees, DRAWS) / error.degrees
+        smallest = self._find_smallest(u, sizes)
+        return float(min((smallest <= smallest[0]).mean(), smallest[0]))
+
+    def bound_probability(self) -> float:
+        """Return the smallest product of `compute_probability`, an upper bound of the probability
+        that needs no draws; NaN without a direction.
+        """
+        sizes = np.ones((len(self.errors), 1))
+        return float(self._find_smallest(self.value[None], sizes)[0]) if self.degrees else np.nan
+
+    def _find_smallest(self, u: FloatArray, sizes: FloatArray) -> FloatArray:
+        """Return the smallest product (n,) for values u (n, k), with estimated variances of the
+        parts of the noise that are `sizes` (s, n) times the true ones.
+        """
+        every = list(range(len(self.names)))
+        kinds = [[every], list(self.group_limbs().values()), [[i] for i in every]]
+        causes = [(self.find_span(p), len(kinds) * len(kind)) for kind in kinds for p in kind]
         smallest = np.full(len(u), np.inf)
         for basis, weight in ((basis, weight) for basis, weight in causes if basis.size):
             rank = basis.shape[1]
@@ -326,7 +340,7 @@ class ParameterChanges:
             left = combine_degrees(np.array(float(rank)), squares)
             statistic = ((u @ basis) ** 2).sum(axis=1) / (shares @ sizes)
             smallest = np.minimum(smallest, weight * compute_f_tail(rank, left, statistic))
-        return float(min((smallest <= smallest[0]).mean(), smallest[0]))
+        return smallest
 
     def group_limbs(self) -> dict[str, list[int]]:
         """Return the places of the parameters of each limb, which their names state first."""
@@ -460,17 +474,19 @@ class JudgedChange(NamedTuple):
     sd: FloatArray
 
 
-def judge_change(changes: ParameterChanges, robot: Mechanism, tests: int = 1) -> JudgedChange:
-    """Test whether a machine has changed, one of a number of tests at `CHANGE_LEVEL` together."""
+def judge_change(
+    changes: ParameterChanges, robot: Mechanism, tests: int = 1, level: float = CHANGE_LEVEL
+) -> JudgedChange:
+    """Test whether a machine has changed, one of a number of tests at `level` together."""
     p_value = changes.compute_probability()
-    moved = bool(p_value < compute_single_level(CHANGE_LEVEL, tests))
+    moved = bool(p_value < compute_single_level(level, tests))
     data: dict[str, Any] = {"chi_square": changes.chi_square, "degrees": float(changes.degrees)}
     too_small = 1.0 - changes.compute_p_value(changes.chi_square, changes.degrees)
     cause, shift, sd = ChangeCause("none"), np.zeros(0), np.zeros(0)
     if not moved and too_small < TOO_WELL:
         data["probability"] = too_small
         return JudgedChange("agree-too-well", data, p_value, moved, cause, shift, sd)
-    data |= {"p_value": p_value, "level": CHANGE_LEVEL}
+    data |= {"p_value": p_value, "level": level}
     if not moved:
         return JudgedChange("machine-unchanged", data, p_value, moved, cause, shift, sd)
     cause, size = explain_change(changes, CAUSE_LEVEL), ""

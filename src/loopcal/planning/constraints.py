@@ -281,6 +281,8 @@ class PlanOptions(PlanSettings):
         held out there.
     curve : whether to compute the expected errors by the number of poses, too. With a goal the
         curve is always computed.
+    allow_fewer_equations : plan also poses that alone do not determine all parameters, such as
+        those of a check, where the expected spreads tell which changes to look for.
     seed : of all random choices.
 
     Raises DataError for a value that is not allowed, and where `n_poses` and `goal` are given.
@@ -309,6 +311,7 @@ class PlanOptions(PlanSettings):
     measured: Measurements | None = field(default=None, repr=False)
     used_names: tuple[str, ...] = field(default=(), repr=False)
     curve: bool = False
+    allow_fewer_equations: bool = False
     seed: int = 1
 
     def __post_init__(self) -> None:

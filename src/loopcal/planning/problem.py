@@ -274,7 +274,7 @@ class PlanningProblem:
     def require_equations(self, n: int) -> None:
         """Refuse n groups that give fewer equations than there are unknowns."""
         k = self.poses_per_group
-        if n < self.min_groups:
+        if n < self.min_groups and not self.options.allow_fewer_equations:
             raise EstimationError(
                 report_finding(
                     "plan.too-few-equations",

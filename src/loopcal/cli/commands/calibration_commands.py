@@ -10,6 +10,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+import click
+
 import loopcal as lc
 from loopcal.cli import options as opt
 from loopcal.cli import terminal
@@ -21,6 +23,7 @@ if TYPE_CHECKING:
     from loopcal.results.tables import Block
 
 OPTIONS = "loopcal.apply.calibration_options:CalibrationOptions"
+CHECK_UP = "loopcal.apply.check_up:check_up"
 REGULARIZATION = "loopcal.diagnose.cross_validation:compute_regularization_curves"
 
 
@@ -249,6 +252,59 @@ def validate(
         lambda: [*view_validation(validation, is_changed, verbose), *hints],
         validation.failures,
     )
+
+
+@opt.command()
+def check_up(
+    run: Path = opt.RUN,
+    checks: tuple[Path, ...] = opt.argument("CHECK...", type=opt.FILE, nargs=-1, required=True),
+    false_alarms: float = opt.option(
+        "Probability of any false alarm in a year.", of=CHECK_UP, type=opt.OPEN_SHARE
+    ),
+    a_year: int = opt.option("Number of checks in a year.", of=CHECK_UP, type=click.IntRange(1)),
+    refit: tuple[str, ...] = opt.option(
+        "Target or surface that moved since RUN, which each check determines. Repeatable.",
+        multiple=True,
+        metavar="NAME",
+    ),
+    output: Path | None = opt.path("Picture of the history (.png, .svg or .pdf) to write.", "-o"),
+    allowed: dict[str, bool] = opt.ALLOWED,
+    force: bool = opt.force("the picture"),
+) -> Output:
+    """Test whether the machine of RUN, a run folder, has changed since its calibration.
+
+    Each CHECK is a measurement file of a few poses, such as 5. Give all checks since RUN in the
+    order of time. Each determines the frame of its instrument; targets keep their values in RUN.
+
+    If the machine has changed, the exit code is 2, and the page names the parameter or limb that
+    explains it.
+
+    Examples:
+      loopcal plan run/robot.yaml -o check --check-up --like tracker.csv
+      loopcal check-up run week-1.csv
+      loopcal check-up run week-*.csv -o history.svg
+    """
+    from loopcal.io.core.outputs import refuse_outputs
+    from loopcal.io.core.text_file import write_bytes
+    from loopcal.report.pictures import save_figure
+
+    if output is not None:
+        refuse_outputs((output,), (run, *checks), force)
+    calibrated = lc.load_run(run)
+    data = {
+        str(file): opt.read_checked_measurements((file,), calibrated.robot, **allowed)
+        for file in checks
+    }
+    with terminal.TerminalProgress("comparing the checks"):
+        result = lc.check_up(
+            calibrated, data, false_alarms=false_alarms, a_year=a_year, refit=refit
+        )
+    written = []
+    if output is not None:
+        save_figure(output, result.plot(), write=write_bytes)
+        written = ["", f"Written to {output}"]
+    hints = list_hints(result.findings)
+    return Output(result.to_dict(), lambda: [*result.page(), *hints, *written], result.failures)
 
 
 @opt.command()

@@ -245,6 +245,8 @@ PLANE_LINE = "plane-line"
 
 OPTIONS = "loopcal.planning.constraints:PlanOptions"
 POSES = "loopcal.planning.constraints:N_POSES"
+CHECK_POSES = 5
+"""Poses of a check by default."""
 SURFACES = "loopcal.planning.plane_line_planning:SurfaceOptions"
 
 _COUNTED = "whose size is --groups and --points"
@@ -255,6 +257,7 @@ EXCLUDED_BY_PLANE_LINE = {
     **dict.fromkeys(("like", "kinds", "components", "orientation", "sigma_angle"), _HELD),
     **dict.fromkeys(("criterion", "n_candidates", "allowed"), _CHOSEN),
     "hold_out": "because it fits every point",
+    "check_up": "which calibrates",
     "share": "which gives no error over the workspace",
     "measured": "which plans without earlier measurements",
     "unknown_frames": "whose surfaces are unknown in every group",
@@ -318,6 +321,10 @@ def plan(
         type=opt.Count("CANDIDATES", 10),
     ),
     curve: bool = opt.flag("Also compute the errors by the number of poses."),
+    check_up: bool = opt.flag(
+        "Plan 5 poses (or --poses) for loopcal check-up, at which changes by the expected spreads "
+        "of ROBOT are clearest. ROBOT is the robot file of a run."
+    ),
     frame: Literal["fitted", "base", "relative"] = opt.frame(
         OPTIONS, "fitted, base, or relative (to home)"
     ),
@@ -337,6 +344,7 @@ def plan(
       loopcal plan 3-prs -o plan --measure x,y,z,phi,theta --max-tilt 20deg --curve
       loopcal plan hexapod-42 -o plan --kind position --seen-from 1.5m,-0.8m,0.6m --cone 60deg
       loopcal plan my-hexapod.yaml -o plan --like tracker.csv --measured last-week.csv
+      loopcal plan run/robot.yaml -o check --check-up --like tracker.csv
       loopcal plan hexapod-nategh-agheli -o plan --measure plane-line --groups 10 --points 8
     """
     from loopcal.io.core.outputs import refuse_folder
@@ -376,6 +384,10 @@ def plan(
         if accuracy is not None and curve:
             raise DataError("--accuracy shows its own curve. Leave out --curve")
         goal, target = accuracy or (None, "pose")
+        if check_up:
+            sentence = "{reason} has poses for no fit, chosen by criterion D. Leave out {option}"
+            opt.refuse_given(("accuracy", "criterion", "hold_out", "curve"), "--check-up", sentence)
+            poses, criterion, hold_out = poses or CHECK_POSES, "D", 0
         earlier = _read_measured(measured, machine) if measured else None
         plan_options = lc.PlanOptions(
             n_poses=poses,
@@ -391,6 +403,7 @@ def plan(
             measured=None if earlier is None else earlier.fitted,
             used_names=() if earlier is None else earlier.labels,
             curve=curve,
+            allow_fewer_equations=check_up,
             seed=seed,
         )
         with terminal.TerminalProgress() as progress:
@@ -404,7 +417,9 @@ def plan(
         *list_hints(result.findings),
         "",
         f"Written to {output}: {written}",
-        suggest_command("calibrate", robot, *data, "-o", "run"),
+        suggest_command("check-up", "RUN", output / "measurements.csv")
+        if check_up
+        else suggest_command("calibrate", robot, *data, "-o", "run"),
     ]
     return Output(document, lambda: page)
 

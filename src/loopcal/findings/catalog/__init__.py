@@ -33,7 +33,7 @@ FILES: Mapping[str, tuple[str, ...]] = {
     "residuals": ("noise", "residuals"),
     "values": ("values",),
     "comparison": ("comparison",),
-    "run_comparison": ("runs",),
+    "run_comparison": ("runs", "checks"),
     "identifiability": ("identifiability", "model"),
     "outliers": ("outliers",),
     "data": ("conventions", "data"),

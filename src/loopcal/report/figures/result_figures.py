@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from loopcal.apply.accuracy import AccuracyMap
+from loopcal.apply.check_up import CheckUp
 from loopcal.apply.conformity import Conformity
 from loopcal.apply.error_budget import LENGTHS, ErrorBudget
 from loopcal.apply.height_errors import HeightErrors
@@ -472,6 +473,42 @@ def draw_run_errors(comparison: RunComparison) -> Figure:
     common = f"{comparison.common_poses} common poses"
     poses = common if has_common else "held-out poses of each run"
     return finish_figure(figure, f"Errors after calibration at the {poses}")
+
+
+@register("figure", CheckUp)
+def draw_check_up(result: CheckUp) -> Figure:
+    """Draw the probability of each check with the level of the alarm, and its prediction errors."""
+    x, n = np.arange(len(result.checks)), len(result.units)
+    figure, panels = start_panels(7.2, 3.4 + 2.2 * n, n + 1, 1, sharex=True)
+    alarm = np.array([check.alarm for check in result.checks])
+    p_values = np.maximum([check.p_value for check in result.checks], SMALLEST_SHOWN)
+    for chosen, color in ((~alarm, COLORS[0]), (alarm, COLORS[1])):
+        panels[0, 0].plot(x[chosen], p_values[chosen], "o", color=color, ms=DOT + 1.0)
+    panels[0, 0].axhline(result.level, **DASHED)
+    panels[0, 0].set_yscale("log")
+    scale_logarithmically(panels[0, 0].yaxis)
+    label_axes(panels[0, 0], "", "probability if unchanged [1]")
+    for (axes,), (quantity, unit) in zip(panels[1:], result.units.items(), strict=True):
+        sizes = np.array([check.errors.get(quantity, np.nan) for check in result.checks])
+        shown = choose_unit(unit, sizes[np.isfinite(sizes)])
+        axes.plot(x, sizes / shown.factor_to_si, "o-", color=COLORS[0], ms=DOT, lw=THIN)
+        axes.set_ylim(bottom=0.0)
+        label_axes(axes, "", f"{quantity} error (rms) [{shown.symbol}]")
+    every = slice(None, None, -(-len(x) // MOST_LABELS))
+    names = [shorten(check.name) for check in result.checks]
+    panels[-1, 0].set_xticks(x[every], names[every], rotation=45, ha="right")
+    handles = [
+        make_handle("check", color=COLORS[0], marker="o", ls="none"),
+        make_handle("alarm", color=COLORS[1], marker="o", ls="none"),
+        make_handle("level of the alarm", **DASHED),
+    ]
+    add_legend(figure, handles)
+    share = f"{100.0 * result.false_alarms:.3g} %"
+    return finish_figure(figure, f"Checks since the calibration; false alarms: {share} a year")
+
+
+SMALLEST_SHOWN, MOST_LABELS = 1e-12, 30
+"""Probability below which a check is drawn at this one; most names of checks."""
 
 
 @register("figure", RunComparison)

@@ -210,9 +210,11 @@ class StudyStore:
         assert scores.shape == (len(scores), self.width), scores.shape
         content, trials = np.ascontiguousarray(scores, dtype="<f8").tobytes(), len(scores)
         digest = _compute_digest(_name_cell(levels), key, block, trials, seconds, content)
+        # sqlite3 knows "INSERT" by the locale's small letters, which in Turkish are "\u0131nsert":
+        # the transaction would not begin, and no row be counted
         with _report_errors(self.path), self.connection:
             done = self.connection.execute(
-                "INSERT INTO blocks VALUES (?, ?, ?, ?, ?, ?, ?) "
+                "insert INTO blocks VALUES (?, ?, ?, ?, ?, ?, ?) "
                 "ON CONFLICT (cell, block) DO NOTHING",
                 (key, self._find_cell(levels), block, trials, content, float(seconds), digest),
             )
@@ -262,7 +264,7 @@ class StudyStore:
             cell = self._find_cell(levels)
             before = self.connection.total_changes
             self.connection.executemany(
-                "INSERT INTO blocks (key, block, trials, seconds, scores, digest, cell) "
+                "insert INTO blocks (key, block, trials, seconds, scores, digest, cell) "
                 f"VALUES (?, ?, ?, ?, ?, ?, {cell}) ON CONFLICT (cell, block) DO NOTHING",
                 other._read_intact(levels),  # another store of this class
             )
@@ -320,7 +322,7 @@ class StudyStore:
     def _find_cell(self, levels: Levels) -> int:
         """Return the row of a cell, which is made where it is missing."""
         name = _name_cell(levels)
-        self.connection.execute("INSERT OR IGNORE INTO cells (levels) VALUES (?)", (name,))
+        self.connection.execute("insert OR IGNORE INTO cells (levels) VALUES (?)", (name,))
         (cell,) = self.connection.execute("SELECT id FROM cells WHERE levels = ?", (name,))
         return int(cell[0])
 
