@@ -72,7 +72,8 @@ def refuse_outputs(
             raise FileError("cannot write here (permission denied). Choose another folder", path)
         if path.is_file() and not force:
             raise FileError(report_finding("files.output-exists"), path)
-        if is_folder_document(path):
+        document = _read_document(path) if path.suffix == ".json" and path.is_file() else None
+        if isinstance((document or {}).get(FILES), dict):  # that of a result folder
             raise FileError(report_finding("files.output-in-result"), path)
 
 
@@ -81,19 +82,6 @@ def restore_on_failure(outputs: Sequence[Path | None]) -> Iterator[None]:
     """Restore or remove these files where the body fails; None is skipped."""
     with restore_files([resolve_target(path) for path in outputs if path is not None]):
         yield
-
-
-def is_folder_document(path: Path) -> bool:
-    """Return whether a file is the document of a result folder, such as the result.json of a run:
-    it lists the other files of its folder.
-    """
-    if path.suffix != ".json" or not path.is_file():
-        return False
-    try:
-        content = read_json(path, "output", "choose another name", TABLE_SIZE)
-    except FileError:
-        return False
-    return isinstance(content, dict) and isinstance(content.get(FILES), dict)
 
 
 def _is_same_file(path: Path, other: Path) -> bool:

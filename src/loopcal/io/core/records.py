@@ -124,7 +124,12 @@ class _RecordReader:
             marks = [mark for mark in arguments[1:] if isinstance(mark, Dimension)]
             return self.read(arguments[0], node, at, marks[0] if marks else of)
         if origin in (Union, types.UnionType):
-            _refuse_tags(arguments, node, at)
+            # a constant that no record of the union has is refused with those of all
+            tags = [_list_tags(branch) for branch in arguments if _is_record(branch)]
+            for key in node if isinstance(node, dict) and tags else ():
+                if all(key in tag for tag in tags):
+                    allowed = dict.fromkeys(constant for tag in tags for constant in tag[key])
+                    _read_literal(tuple(allowed), node[key], (*at, key))
             branch = max(arguments, key=lambda branch: _fit(branch, node))
             return self.read(branch, node, at, of)
         if origin is Literal:
@@ -250,17 +255,6 @@ def _list_tags(record: Any) -> dict[str, tuple[Any, ...]]:
     """Return key -> constants of the fields that tell a record from others."""
     hints = get_field_types(record)
     return {key: get_args(h) for key, h in hints.items() if get_origin(h) is Literal}
-
-
-def _refuse_tags(branches: tuple[Any, ...], node: Any, at: Location) -> None:
-    """Refuse a mapping with a constant that no record of a union has; name those of all."""
-    if not isinstance(node, dict):
-        return
-    tags = [_list_tags(branch) for branch in branches if _is_record(branch)]
-    for key in node:
-        if tags and all(key in tag for tag in tags):
-            allowed = dict.fromkeys(constant for tag in tags for constant in tag[key])
-            _read_literal(tuple(allowed), node[key], (*at, key))
 
 
 def _read_literal(allowed: tuple[Any, ...], node: Any, at: Location) -> Any:

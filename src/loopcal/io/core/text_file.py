@@ -126,21 +126,6 @@ _NAME_BYTES = 200
 @contextmanager
 def create_temporary(target: Path, is_folder: bool = False) -> Iterator[Path]:
     """Yield a new, locked, empty file or folder beside `target`, and remove what is left of it."""
-    path, descriptor = _create_locked(target, is_folder)
-    try:
-        yield path
-    finally:
-        _remove(path)
-        if descriptor is not None:
-            os.close(descriptor)
-
-
-def _create_locked(target: Path, is_folder: bool) -> tuple[Path, int | None]:
-    """Create a file or folder of a new name, and lock it.
-
-    Another writer may find it before it is locked and take it for a leftover; then it is created
-    again.
-    """
     while True:
         path = _name_beside(target, NEW)
         if is_folder:
@@ -150,19 +135,19 @@ def _create_locked(target: Path, is_folder: bool) -> tuple[Path, int | None]:
             flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | getattr(os, "O_NOFOLLOW", 0)
             descriptor = os.open(path, flags | getattr(os, "O_BINARY", 0), 0o666)
         if descriptor is None and path.is_dir():
-            return path, None
+            break
         if descriptor is None:
             continue
+        # another writer may find it before it is locked and take it for a leftover
         if lock(descriptor) is not False and is_open(path, descriptor):
-            return path, descriptor
+            break
         os.close(descriptor)
-
-
-def place_file(temporary: Path, target: Path, path: Path) -> None:
-    """Give a complete, synchronized file its name; `path` is how the user calls it."""
-    note_output(path, target, temporary)
-    temporary.replace(target)
-    sync_folder(target.parent)
+    try:
+        yield path
+    finally:
+        _remove(path)
+        if descriptor is not None:
+            os.close(descriptor)
 
 
 def place_folder(
@@ -423,7 +408,14 @@ def open_bytes(path: str | Path, what: str) -> Iterator[BufferedReader]:
     """Open an ordinary file to read it; raise FileError as `read_bytes` but for the size."""
     path = as_path(path, what)
     try:
-        with os.fdopen(_open_ordinary_file(path, what), "rb") as stream:
+        if path.is_dir():  # not every system opens a folder
+            raise FileError(f"this is a folder, not a {what}. Name a file in it", path)
+        # opening does not wait, as it would for a pipe, and what was opened is examined rather than
+        # the name, which may denote another file a moment later
+        with os.fdopen(os.open(path, OPEN_FLAGS), "rb") as stream:
+            if not stat.S_ISREG(os.fstat(stream.fileno()).st_mode):
+                sentence = f"this is a device or a pipe, not a {what}. Save it as an ordinary file"
+                raise FileError(f"{sentence} and name that", path)
             yield stream
     except FileNotFoundError:
         raise FileError(
@@ -432,22 +424,6 @@ def open_bytes(path: str | Path, what: str) -> Iterator[BufferedReader]:
     except OSError as error:
         action = ACTIONS.get(error.errno or 0, "check the file, its path and its permissions")
         raise FileError(f"cannot read this {what} ({_reason(error)}); {action}", path) from error
-
-
-def _open_ordinary_file(path: Path, what: str) -> int:
-    """Return the descriptor of a file; raise FileError for a folder, a device or a pipe.
-
-    Opening does not wait, as it would for a pipe. What was opened is examined rather than the name,
-    which may denote another file a moment later.
-    """
-    if path.is_dir():  # not every system opens a folder
-        raise FileError(f"this is a folder, not a {what}. Name a file in it", path)
-    descriptor = os.open(path, OPEN_FLAGS)
-    if stat.S_ISREG(os.fstat(descriptor).st_mode):
-        return descriptor
-    os.close(descriptor)
-    sentence = f"this is a device or a pipe, not a {what}. Save it as an ordinary file"
-    raise FileError(f"{sentence} and name that", path)
 
 
 def sha256(path: str | Path) -> str:
@@ -504,7 +480,9 @@ def replace_file(path: str | Path) -> Iterator[Path]:
             sync_file(temporary)
             if target.exists():
                 temporary.chmod(stat.S_IMODE(target.stat().st_mode))
-            place_file(temporary, target, Path(path))
+            note_output(Path(path), target, temporary)
+            temporary.replace(target)
+            sync_folder(target.parent)
 
 
 @contextmanager

@@ -8,8 +8,6 @@ interval, empty (null in JSON) where it is unknown or not finite.
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -17,7 +15,7 @@ from typing import Any, Literal
 
 from loopcal.errors import DataError, FileError, MechanismError
 from loopcal.findings import Finding, report_finding
-from loopcal.io.core.csv_table import format_scaled
+from loopcal.io.core.csv_table import format_columns, format_scaled
 from loopcal.io.core.text_file import write_text
 from loopcal.io.core.yaml_file import parse_yaml
 from loopcal.io.data.measurement_file import save_measurements
@@ -120,11 +118,9 @@ def _list_rows(source: ExportSource) -> list[dict[str, Any]]:
 def write_csv(source: ExportSource, into: Path | None) -> Exported:
     """Return the parameters as CSV."""
     del into
-    stream = io.StringIO()
-    writer: csv.DictWriter[str] = csv.DictWriter(stream, COLUMNS, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(_list_rows(source))
-    return Exported(stream.getvalue(), _report_intervals(source))
+    rows = _list_rows(source)
+    text = format_columns({name: [row[name] for row in rows] for name in COLUMNS})
+    return Exported(text, _report_intervals(source))
 
 
 def write_json(source: ExportSource, into: Path | None) -> Exported:

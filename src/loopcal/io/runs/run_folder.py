@@ -28,7 +28,7 @@ from dataclasses import astuple, dataclass, field, make_dataclass, replace
 from functools import cache
 from pathlib import Path
 from types import GenericAlias
-from typing import TYPE_CHECKING, Any, BinaryIO, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -255,7 +255,15 @@ def read_arrays(
     """
     with open_bytes(path, WHAT) as stream:
         size.check(os.fstat(stream.fileno()).st_size, WHAT, path)
-        count.check(_count_members(stream), WHAT, path)
+        length = stream.seek(0, os.SEEK_END)
+        if length < END.size:
+            raise ValueError("it is too short")
+        stream.seek(length - END.size)
+        signature, *counts = END.unpack(stream.read(END.size))
+        if signature != b"PK\5\6":
+            raise ValueError("it is not an archive, or its end is missing")
+        count.check(int(counts[3]), WHAT, path)
+        stream.seek(0)
         try:
             with zipfile.ZipFile(stream) as archive:
                 members = archive.infolist()
@@ -267,19 +275,6 @@ def read_arrays(
                 }
         except FAULTS as error:
             raise ValueError(str(error) or "it ends too early") from error
-
-
-def _count_members(stream: BinaryIO) -> int:
-    """Return the number of members that the end of an archive states."""
-    length = stream.seek(0, os.SEEK_END)
-    if length < END.size:
-        raise ValueError("it is too short")
-    stream.seek(length - END.size)
-    signature, *counts = END.unpack(stream.read(END.size))
-    if signature != b"PK\5\6":
-        raise ValueError("it is not an archive, or its end is missing")
-    stream.seek(0)
-    return int(counts[3])
 
 
 def _read_member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:

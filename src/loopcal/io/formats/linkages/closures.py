@@ -161,7 +161,17 @@ def read_mechanism(tree: LinkTree, path: Path | None) -> Linkage:
         couplings = [Coupling(j.name, *j.mimic) for j in known if j.mimic is not None and j.kind]
         graph, left = couple_joints(graph, couplings)
     except MechanismError as error:
-        raise _locate_error(error, tree, closures) from None
+        # at the line of the closure that the error names
+        finding = error.finding
+        name = "" if finding is None else finding.data.get("closure", "")
+        frame = name.removesuffix(BALL_NAME)
+        at = [i for i, pair in enumerate(closures.pairs) if frame == pair[0]]
+        at = at or [i for i, pair in enumerate(closures.pairs) if frame in pair]
+        if at and closures.file is not None:
+            raise closures.file.error(finding, ("closed_loop", at[-1])) from None
+        lines = {constraint.name: constraint.line for constraint in tree.constraints}
+        line = lines.get(name) or (tree.joints[name].line if name in tree.joints else None)
+        raise FileError(error.args[0], tree.path, line) from None
     rigid = []
     # a pin is a closure of type 6d only where a revolute joint carries one of its frames
     for pair, kind in zip(closures.pairs, closures.kinds, strict=True):
@@ -411,17 +421,3 @@ def _split(tree: LinkTree, joint: TreeJoint, axes: FloatArray) -> Iterator[Graph
             limits=None,
         )
         body = after
-
-
-def _locate_error(error: MechanismError, tree: LinkTree, closures: Closures) -> FileError:
-    """Return an error of the mechanism at the line of the closure that it names."""
-    finding = error.finding
-    name = "" if finding is None else finding.data.get("closure", "")
-    frame = name.removesuffix(BALL_NAME)
-    places = [i for i, pair in enumerate(closures.pairs) if frame == pair[0]]
-    places = places or [i for i, pair in enumerate(closures.pairs) if frame in pair]
-    if places and closures.file is not None:
-        return closures.file.error(finding, ("closed_loop", places[-1]))
-    lines = {constraint.name: constraint.line for constraint in tree.constraints}
-    line = lines.get(name) or (tree.joints[name].line if name in tree.joints else None)
-    return FileError(error.args[0], tree.path, line)

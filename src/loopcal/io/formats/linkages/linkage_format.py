@@ -268,8 +268,17 @@ def read(tree: LinkTree, options: ImportOptions, what: str) -> Imported:
         data = error.args[0].data.items()
         named = {k: choose_link(mechanism, v) if k in bodies else v for k, v in data}
         finding = replace(error.args[0], data=named)
-        _check_couplings(mechanism, finding.data.get("joints", ()))
-        raise tree.error(finding, _find_origin(tree, finding.data.get("joints", ()))) from None
+        joints = finding.data.get("joints", ())
+        _check_couplings(mechanism, joints)
+        # the last joint of the file among them; parts of a replaced joint end in _X, _Y or _Z, and
+        # a closure has the name of a link
+        origins = (
+            origin
+            for name in reversed(joints)
+            for origin in (name, name[:-2], tree.carrier[name].name if name in tree.carrier else "")
+        )
+        place = next((origin for origin in origins if origin in tree.places), "")
+        raise tree.error(finding, place) from None
     moving = [name for j in paths.graph.joints for name in (j.name, j.origin_a, j.origin_b)]
     _check_couplings(mechanism, moving)
     closing = closures.name if closures is not None else "its constraints"
@@ -325,19 +334,6 @@ def _find_platform(mechanism: Linkage, name: str | None) -> tuple[str, str]:
         return possible[0], choose_link(mechanism, possible[0])
     finding = report_finding("files.platform-unclear", frames=tuple(frames), links=links)
     raise FileError(finding, tree.path)
-
-
-def _find_origin(tree: LinkTree, names: Sequence[str]) -> str:
-    """Return the last joint of the file among joints of a mechanism; empty where there is none.
-
-    Parts of a replaced joint end in _X, _Y or _Z; a closure has the name of a link.
-    """
-    for name in reversed(names):
-        carrier = tree.carrier.get(name)
-        for joint in (name, name[:-2], carrier.name if carrier is not None else ""):
-            if joint in tree.places:
-                return joint
-    return ""
 
 
 def _check_couplings(mechanism: Linkage, names: Collection[str]) -> None:
@@ -435,7 +431,16 @@ def describe_limb(
         is_tip = joint is last and ends_in_point
         element = ("tip" if chain else on) if is_tip else joint.name
         if before is not None and before.origin_b:
-            parameters += _list_far_shifts(name, before, element, place)
+            # the shifts of a far origin as shifts of the next place
+            for axis in before.shifts:
+                shares = zip("xyz", _clear(-place["xyz".index(axis), :3]), strict=True)
+                maps = [
+                    {"limb": name, "element": element, "axis": letter, "coefficient": share}
+                    for letter, share in shares
+                    if share
+                ]
+                far = {"name": f"{name}.{before.origin_b}.{axis}", "length": 0, "maps": maps}
+                parameters.append(far)
         if joint.origin_a:
             errors.append(_describe_shifts(element, joint.origin_a, joint.shifts))
         if is_tip:
@@ -484,20 +489,6 @@ def _describe_shifts(element: str, origin: str, axes: str) -> Content:
     """Return one entry of `errors:`."""
     name = {} if element == origin else {"name": origin}
     return {"of": element, **name, "shift": list(axes)}
-
-
-def _list_far_shifts(
-    limb: str, joint: GraphJoint, element: str, place: FloatArray
-) -> Iterator[Content]:
-    """Yield entries of `parameters:`, the shifts of a far origin as shifts of the next place."""
-    for axis in joint.shifts:
-        coefficients = zip("xyz", _clear(-place["xyz".index(axis), :3]), strict=True)
-        maps = [
-            {"limb": limb, "element": element, "axis": letter, "coefficient": coefficient}
-            for letter, coefficient in coefficients
-            if coefficient
-        ]
-        yield {"name": f"{limb}.{joint.origin_b}.{axis}", "length": 0, "maps": maps}
 
 
 def _describe_limb_joint(paths: LimbPaths, joint: GraphJoint, place: FloatArray) -> Content:

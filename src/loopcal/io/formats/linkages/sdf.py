@@ -228,7 +228,14 @@ def read_tree(path: Path) -> LinkTree:
                 sentence = f"joint {joint.name!r} names the link {link!r}, which does not exist"
                 raise joint.element.error(f"{sentence}{suggest_names(link, drawn)}. Correct it")
     geared = [joint for joint in joints if joint.kind == GEARBOX]
-    carried, closing = _span(list(drawn), [j for j in joints if j.kind != GEARBOX])
+    joints = [joint for joint in joints if joint.kind != GEARBOX]
+    children = {joint.child for joint in joints}
+    reached = {link for link in drawn if link not in children}
+    carried: list[SdfJoint] = []  # of each link the first joint, from links without parents on
+    while ready := [j for j in joints if j.parent in reached and j.child not in reached]:
+        carried.append(ready[0])
+        reached.add(ready[0].child)
+    closing = [joint for joint in joints if joint not in carried]
     tree = [part for joint in carried for part in _carry(joint, drawn)]
     followed = {j.name: _read_mimic(e) for j in carried if (e := j.element.find("axis", "mimic"))}
     followed |= dict(_read_gearbox(joint, carried) for joint in geared)
@@ -238,22 +245,6 @@ def read_tree(path: Path) -> LinkTree:
     motors, used = _list_motors([model]), [*drawn, *frame_links]
     built = build_tree(path, text, used, tree, constraints, motors, rewrite, WHAT)
     return replace(built, hidden=frozenset(frame_links))
-
-
-def _span(
-    links: Sequence[str], joints: Sequence[SdfJoint]
-) -> tuple[list[SdfJoint], list[SdfJoint]]:
-    """Return the joints that carry a link, from those without parents on, and the others."""
-    children = {joint.child for joint in joints}
-    reached = {link for link in links if link not in children}
-    carried: list[SdfJoint] = []
-    while True:
-        ready = [j for j in joints if j.parent in reached and j.child not in reached]
-        if not ready:
-            break
-        carried.append(ready[0])
-        reached.add(ready[0].child)
-    return carried, [joint for joint in joints if joint not in carried]
 
 
 def _carry(joint: SdfJoint, drawn: Mapping[str, FloatArray]) -> tuple[TreeJoint, ...]:
