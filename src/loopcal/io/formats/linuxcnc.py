@@ -44,6 +44,7 @@ from loopcal.io.formats.program_format import (
     round_digits,
 )
 from loopcal.mechanism.families.gough import Gough
+from loopcal.mechanism.families.records import values_per_leg
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension, find_unit
 
@@ -166,19 +167,17 @@ def _list_pins(
                 shifted = value - (lift if axis == "z" else 0.0)
                 shifted = source.round_number(shifted, name, factor, DECIMALS)
                 pins[f"{side}.{n}.{axis}"] = float(format_scaled(shifted, 1.0))
-    if record.screw is not None:
-        legs = record.screw.legs()
-        lead = abs(legs[0].lead) if present is None else math.copysign(legs[0].lead, present)
-        if any(abs(abs(leg.lead) - abs(lead)) > ROUNDING * abs(lead) for leg in legs):
+    if (screw := record.screw) is not None:
+        leads = values_per_leg(screw.lead, 6, "the screw's lead")
+        lead = abs(leads[0]) if present is None else math.copysign(leads[0], present)
+        if any(abs(abs(own) - abs(lead)) > ROUNDING * abs(lead) for own in leads):
             sentence = f"{source.robot.name} has screws of different lead, but genhexkins has one"
             raise DataError(f"{sentence} lead. Use json or csv")
         pins[LEAD] = lead / factor
-        for n, leg in enumerate(legs):
-            sign = math.copysign(1.0, leg.lead * lead)
-            for i, axis in enumerate("xyz"):
-                pins[f"base-n.{n}.{axis}"] = leg.base_axis[i]
-            for i, axis in enumerate("xyz"):
-                pins[f"platform-n.{n}.{axis}"] = 0.0 + sign * leg.platform_axis[i]
+        for n, own in enumerate(leads):
+            turned = np.copysign(1.0, own * lead) * np.array(screw.platform_axes[n]) + 0.0
+            for side, axes in (("base-n", screw.base_axes[n]), ("platform-n", turned.tolist())):
+                pins |= {f"{side}.{n}.{axis}": axes[i] for i, axis in enumerate("xyz")}
     return {(COMPONENT, pin): value for pin, value in pins.items()}
 
 
