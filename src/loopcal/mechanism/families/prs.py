@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import ClassVar, Literal, NamedTuple
+from typing import ClassVar, Literal
 
 import numpy as np
 
@@ -46,75 +46,50 @@ from loopcal.typing import FloatArray
 from loopcal.units import Dimension, Length
 
 
-class ChainFrames(NamedTuple):
-    """The frames in which a limb with a guide begins and ends.
+def build_carriage_limb(
+    number: int,
+    base: FloatArray,
+    platform: FloatArray,
+    length: float,
+    home: FloatArray,
+    axis: str = "",
+    axes: bool = False,
+) -> PlacedLimb:
+    """Return the limb `chain1` with the drive `q1`, or another number: a carriage and a rod [m].
 
-    Attributes
-    ----------
-    base : (4, 4) chain frame in the base, at the foot of the guide. platform : (4, 4) chain frame
-        in the platform, at the ball.
-    length : of the rod [m]. home : (4, 4) T_base_platform of the home pose.
+    base, platform : (4, 4) chain frames, at the foot of the guide in the base and at the upper ball
+        in the platform. home : (4, 4) T_base_platform.
+    axis : of the revolute joint at the carriage (x or y), with the rod upwards; without it a ball.
+    axes : three axes replace the upper ball, a universal joint the lower one.
     """
-
-    base: FloatArray
-    platform: FloatArray
-    length: float
-    home: FloatArray
-
-    @property
-    def orientation(self) -> FloatArray:
-        """Orientation (3, 3) of the platform's chain frame in that of the base, at home."""
-        return self.base[:3, :3].T @ self.home[:3, :3] @ self.platform[:3, :3]
-
-    def gap(self, name: str) -> FloatArray:
-        """Return the vector from the foot of the guide to the ball at home (3,) [m]."""
-        gap = (geometry.invert_pose(self.base) @ self.home @ self.platform)[:3, 3]
-        aside = float(np.hypot(gap[0], gap[1]))
-        if not aside < self.length:
-            raise MechanismError(
-                f"the rod of {name} is {self.length * 1e3:g} mm long, but its ball is "
-                f"{aside * 1e3:.6g} mm away from the guide at home. Give a longer rod"
-            )
-        return gap
-
-
-def build_prs_limb(name: str, motor: str, frames: ChainFrames, axis: str, axes: bool) -> PlacedLimb:
-    """Return a limb of carriage, revolute joint about `axis` (x or y), rod upwards and ball.
-
-    `axes` replaces the ball by three axes.
-    """
-    gap, length = frames.gap(name), frames.length
+    name, T = f"chain{number}", geometry.invert_pose(base) @ home @ platform
+    gap, aside = T[:3, 3], float(np.hypot(T[0, 3], T[1, 3]))
+    if not aside < length:
+        raise MechanismError(
+            f"the rod of {name} is {length * 1e3:g} mm long, but its ball is {aside * 1e3:.6g} mm "
+            "away from the guide at home. Give a longer rod"
+        )
     # the rod points along z at joint angle zero and leans towards the ball at home
-    lean = float(np.arcsin(gap[0] / length if axis == "y" else -gap[1] / length))
-    turn = EY if axis == "y" else EX
-    guide = Joint("guide", "P", motor, start=float(gap[2] - length * np.cos(lean)))
-    steps = (
-        JointPlacement(guide, frames.base, EZ),
-        JointPlacement(Joint("joint", "R", start=lean), np.eye(4), turn),
+    lean = float(np.arcsin((gap[0] if axis == "y" else -gap[1]) / length))
+    height = float(
+        length * np.cos(lean) if axis else np.sqrt(length**2 - gap[0] ** 2 - gap[1] ** 2)
     )
-    upright = geometry.exp_so3(-lean * turn) @ frames.orientation if axes else None
-    return place_limb_with_ball(name, steps, length * EZ, frames.platform, upright)
-
-
-def build_pus_limb(name: str, motor: str, frames: ChainFrames, axes: bool) -> PlacedLimb:
-    """Return a limb of a carriage and a rod of fixed length between two balls.
-
-    `axes` replaces them by a universal joint and three axes.
-    """
-    gap = frames.gap(name)
-    height = float(np.sqrt(frames.length**2 - gap[0] ** 2 - gap[1] ** 2))
-    slide = Joint("guide", "P", motor, start=float(gap[2] - height))
-    guide = JointPlacement(slide, frames.base, EZ)
-    if not axes:
-        return place_limb(name, (guide,), np.eye(4), "distance", frames.platform, frames.length)
-    rod = np.array([gap[0], gap[1], height])
-    first = np.cross(rod, EY)
-    steps = (
-        guide,
-        JointPlacement(Joint("universal1", "R"), np.eye(4), first),
-        JointPlacement(Joint("universal2", "R"), np.eye(4), np.cross(rod, first)),
-    )
-    return place_limb_with_ball(name, steps, rod, frames.platform, frames.orientation)
+    slide = Joint("guide", "P", name.replace("chain", "q"), start=float(gap[2] - height))
+    steps: tuple[JointPlacement, ...] = (JointPlacement(slide, base, EZ),)
+    rod, upright = np.array([gap[0], gap[1], height]), T[:3, :3]
+    if axis:
+        turn = EY if axis == "y" else EX
+        steps += (JointPlacement(Joint("joint", "R", start=lean), np.eye(4), turn),)
+        rod, upright = length * EZ, geometry.exp_so3(-lean * turn) @ upright
+    elif axes:
+        first = np.cross(rod, EY)
+        steps += (
+            JointPlacement(Joint("universal1", "R"), np.eye(4), first),
+            JointPlacement(Joint("universal2", "R"), np.eye(4), np.cross(rod, first)),
+        )
+    else:
+        return place_limb(name, steps, np.eye(4), "distance", platform, length)
+    return place_limb_with_ball(name, steps, rod, platform, upright if axes else None)
 
 
 def carriage_errors(
@@ -230,9 +205,8 @@ class RuPusPrs(CarriageRobot):
     def expand(self) -> Assembly:
         """Return three limbs under a free platform."""
         a, b, axes = self.platform_radius, self.base_radius, self.spherical == "axes"
-        home, spread = self.home.matrix, self.tolerances
-        first = ChainFrames(translate(-b), translate(-a), self.rod, home)
-        second = ChainFrames(translate(0.0, b), translate(0.0, a), self.rod, home)
+        of_rods, spread = (self.rod, self.home.matrix), self.tolerances
+        second = translate(0.0, b), translate(0.0, a)
         # revolute joint, link and universal joint; at home all frames are parallel
         steps = (
             JointPlacement(Joint("pivot", "R"), np.eye(4), EY),
@@ -240,8 +214,8 @@ class RuPusPrs(CarriageRobot):
             JointPlacement(Joint("universal2", "R"), np.eye(4), EY),
         )
         limbs = (
-            build_pus_limb("chain1", "q1", first, axes),
-            build_prs_limb("chain2", "q2", second, "x", axes),
+            build_carriage_limb(1, translate(-b), translate(-a), *of_rods, "", axes),
+            build_carriage_limb(2, *second, *of_rods, "x", axes),
             place_limb("chain3", steps, np.eye(4), "rigid", np.eye(4)),
         )
 
@@ -281,9 +255,9 @@ class ThreePrs(CarriageRobot):
         base, platform = translate(self.base_radius), translate(self.platform_radius)
         turns = [rotate_about(EZ, 2 * np.pi / 3 * k) for k in range(3)]
         home, axes, spread = self.home.matrix, self.spherical == "axes", self.tolerances
-        frames = [ChainFrames(T @ base, T @ platform, self.rod, home) for T in turns]
         limbs = [
-            build_prs_limb(f"chain{k}", f"q{k}", own, "y", axes) for k, own in enumerate(frames, 1)
+            build_carriage_limb(k, T @ base, T @ platform, self.rod, home, "y", axes)
+            for k, T in enumerate(turns, 1)
         ]
         chosen = {"foot": "xyz", "guide": "xyz", "joint": "xyz"}
         if self.parameter_set == "eleven":
