@@ -357,12 +357,14 @@ class RobotRecord:
         controlled: tuple[str, ...],
         own: Iterable[Actuator] = (),
         complete: LinkTolerances | None = None,
+        later: ErrorModel | None = None,
     ) -> Assembly:
         """Return the assembly of limbs at the home pose of this record, with the drives and
         parameters that it states.
 
-        errors : the unknowns of the family. own : what the family knows of its drives. complete :
-        tolerances of the errors of every link and drive, which are unknown, too, where stated.
+        errors, later : the unknowns of the family, before and behind those of drives.
+        own : what the family knows of its drives. complete : tolerances of the errors of every link
+        and drive, which are unknown, too, where stated.
         """
         columns = {name: of for name, of in self.conditions.items() if name not in FORCES}
         conditions = tuple(list_conditions(columns))
@@ -375,6 +377,7 @@ class RobotRecord:
                 errors,
                 *map(row_errors, rows.values()),
                 *(named_error(named, limbs, rows) for named in self.parameters),
+                *([later] if later else []),
             )
         )
         if complete is not None:

@@ -37,6 +37,7 @@ from loopcal.mechanism.families.limbs import ORIGIN, Axis, Place, axis_vector, m
 from loopcal.mechanism.families.placement import (
     AngleTolerance,
     ErrorModel,
+    Freedom,
     JointPlacement,
     LengthTolerance,
     LinkTolerances,
@@ -53,14 +54,7 @@ from loopcal.mechanism.families.placement import (
     standard_deviation,
     strip_number,
 )
-from loopcal.mechanism.families.records import (
-    Freedom,
-    MapEntry,
-    NamedAngle,
-    NamedLength,
-    NamedParameter,
-    RobotRecord,
-)
+from loopcal.mechanism.families.records import RobotRecord
 from loopcal.units import Dimension, Given, Ratio
 
 # The assembly of a chain: those of its stages, with the stage before each name.
@@ -398,28 +392,21 @@ def expand_joint(
             "drives",
             drive,
         )
-    of_platform = [_name_displacement(record, axis) for axis in record.platform_errors]
-    robot = RobotRecord(
-        name, drives={drive: triangle} if triangle else stated, parameters=tuple(of_platform)
-    )
+    robot = RobotRecord(name, drives={drive: triangle} if triangle else stated)
     errors = join_errors(_joint_error(record, limb, drive, error) for error in record.errors)
-    return robot.assemble([limb], errors, freedoms=AXES, controlled=(), own=[own])
-
-
-def _name_displacement(record: SerialRotation | SerialSlide, axis: Freedom) -> NamedParameter:
-    """Return a displacement of the platform of a serial joint as a parameter."""
-    name, maps = f"platform.{axis}", (MapEntry(LIMB, "platform", axis),)
-    if get_axis_dimension(axis) is Dimension.ANGLE:
-        return NamedAngle(name, 0.0, maps, record.angle)
-    return NamedLength(name, 0.0, maps, record.length)
+    of_platform = join_errors(
+        displacement_error(f"platform.{axis}", limb, "platform", axis, _tolerance(record, axis))
+        for axis in record.platform_errors
+    )
+    return robot.assemble(
+        [limb], errors, freedoms=AXES, controlled=(), own=[own], later=of_platform
+    )
 
 
 def _refuse_terms_beside_triangle(record: SerialRotation | SerialSlide, drive: str) -> None:
     """Refuse what a triangle drive states itself; raises MechanismError."""
-    stated = {"stroke": record.stroke is not None, "gain": record.gain != 1.0}
-    stated |= {"sigma": record.sigma is not None}
-    for key in ("offset", "gain"):
-        stated[f"errors: [{key}]"] = key in record.errors
+    stated = {key: getattr(record, key) not in (None, 1.0) for key in ("stroke", "gain", "sigma")}
+    stated |= {f"errors: [{key}]": key in record.errors for key in ("offset", "gain")}
     for key, is_stated in stated.items():
         if is_stated:
             raise MechanismError(
@@ -437,8 +424,12 @@ def _joint_error(
         gain = LinearMap(error, Address(drive, "transmission", error))
         sd = standard_deviation(record.ratio, error)
         return single_error(error, Dimension.RATIO, record.gain, sd, gain, positive=True)
-    turns = record.GIVEN is Dimension.ANGLE if error == "offset" else error in AXES[:3]
-    sd = standard_deviation(record.angle if turns else record.length, error)
     if error == "offset":
-        return offset_error(error, drive, record.GIVEN, 0.0, sd)
-    return displacement_error(error, limb, LINK, error, sd)
+        return offset_error(error, drive, record.GIVEN, 0.0, _tolerance(record, error))
+    return displacement_error(error, limb, LINK, error, _tolerance(record, error))
+
+
+def _tolerance(record: SerialRotation | SerialSlide, error: str) -> float | None:
+    """Return the tolerance of an unknown of a serial joint that is a length or an angle."""
+    dimension = get_axis_dimension(error) if error in AXES else record.GIVEN
+    return standard_deviation(getattr(record, dimension.value), error)
