@@ -405,7 +405,8 @@ def expand_joint(
 
 def _refuse_terms_beside_triangle(record: SerialRotation | SerialSlide, drive: str) -> None:
     """Refuse what a triangle drive states itself; raises MechanismError."""
-    stated = {key: getattr(record, key) not in (None, 1.0) for key in ("stroke", "gain", "sigma")}
+    plain, keys = SerialRotation(kind="R"), ("stroke", "gain", "sigma")
+    stated = {key: getattr(record, key) != getattr(plain, key) for key in keys}
     stated |= {f"errors: [{key}]": key in record.errors for key in ("offset", "gain")}
     for key, is_stated in stated.items():
         if is_stated:
