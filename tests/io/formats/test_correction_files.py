@@ -31,7 +31,7 @@ def export(truth: lc.Mechanism, controller: lc.Mechanism, name: str) -> Exported
     assert known.table is not None
     assert known.write is not None
     tables, _ = make_tables(truth, controller, TableSize(*known.table), LIMIT)
-    return known.write(ExportSource(truth, tables=tables), None)
+    return known.write(ExportSource(truth, tables=tables, stem="table"), None)
 
 
 def move(truth: lc.Mechanism, controller: lc.Mechanism, commands: np.ndarray) -> np.ndarray:
@@ -140,8 +140,8 @@ def test_every_joint_of_linuxcnc_has_a_file(machine: Pair) -> None:
     exported = export(*machine, "grid-linuxcnc")
     for joint in range(3):
         assert f"[JOINT_{joint}]" in exported.text
-        assert f"COMP_FILE = joint{joint}.comp" in exported.text
-        rows = np.loadtxt(io.StringIO(exported.beside[f"joint{joint}.comp"]))
+        assert f"COMP_FILE = table-joint{joint}.comp" in exported.text
+        rows = np.loadtxt(io.StringIO(exported.beside[f"table-joint{joint}.comp"]))
         assert rows.shape[1] == 3
         assert len(rows) <= 256
         assert (np.diff(rows[:, 0]) > 0).all()
@@ -152,9 +152,9 @@ def test_the_command_writes_tables_and_keeps_files(tmp_path: Path, capsys) -> No
     command = ["export", str(tmp_path / "true.yaml"), "--controller", "linear-delta", "--format"]
     output = ["-o", str(tmp_path / "joints.ini")]
     assert main([*command, "grid-linuxcnc", *output]) == 0
-    assert (tmp_path / "joint2.comp").exists()
+    assert (tmp_path / "joints-joint2.comp").exists()
     (tmp_path / "joints.ini").unlink()
-    assert main([*command, "grid-linuxcnc", *output]) == 1  # joint0.comp is there
+    assert main([*command, "grid-linuxcnc", *output]) == 1  # the files of joints are there
     assert not (tmp_path / "joints.ini").exists()
     assert main([*command, "grid-linuxcnc", *output, "--force"]) == 0
     capsys.readouterr()

@@ -476,7 +476,8 @@ def export(
     if target.table is not None:
         old = run.initial_robot if controller is None else lc.load_robot(controller)
         tables, noted = make_tables(robot, old, TableSize(*target.table), table_error)
-        loaded, moved = replace(loaded, tables=tables), (*moved, noted)
+        stem = target.name if output is None else output.stem
+        loaded, moved = replace(loaded, tables=tables, stem=stem), (*moved, noted)
     loaded = replace(loaded, is_for_people=output is None, findings=moved)
     exported = export_robot(loaded, target, into)
     written: dict[Path, str] = {}

@@ -114,10 +114,11 @@ def write_compensation(source: ExportSource, into: Path | None) -> Exported:
         is_length = dimensions[name] is Dimension.LENGTH
         unit = robot.get_unit(Dimension.LENGTH) if is_length else UNITS["deg"]
         rows = np.column_stack([nodes, trims, trims]) / unit.factor_to_si
-        files[f"joint{joint}.comp"] = "".join(
+        file = f"{source.stem}-joint{joint}.comp"
+        files[file] = "".join(
             " ".join(map(format_number, (0.0 + row).tolist())) + "\n" for row in rows
         )
-        lines += [f"[JOINT_{joint}]  # {name}", f"COMP_FILE = joint{joint}.comp"]
+        lines += [f"[JOINT_{joint}]  # {name}", f"COMP_FILE = {file}"]
         lines += ["COMP_FILE_TYPE = 1"]
     notes = note_lost_terms(robot, COMPENSATION.name)
     if source.is_for_people:

@@ -117,6 +117,7 @@ class ExportSource:
     is_for_people : whether the numbers are to be read and typed: an identified value then has the
         digits that its interval supports. Files for programs have all digits.
     findings : about these values in any controller. tables : corrections, for a format of tables.
+    stem : first part of the names of files beside the one that is written.
     """
 
     robot: Mechanism
@@ -125,6 +126,7 @@ class ExportSource:
     is_for_people: bool = False
     findings: tuple[Finding, ...] = ()
     tables: tuple[CorrectionTable, ...] = ()
+    stem: str = ""
 
     def round_number(self, number: float, name: str, factor: float, most: int) -> float:
         """Return a number as it is written, in a unit of `factor` to SI: for people to the third
