@@ -69,6 +69,19 @@ def test_rows_of_one_target_are_those_of_all(kind, monkeypatch) -> None:
     assert (shared := ObservationRows(kind, poses, measured, mixed, used)).divided() is shared
 
 
+def test_derivatives_of_a_tiny_machine_are_those_of_a_large_one() -> None:
+    """Derivatives by angles of a frame were zero where arms are below 1e-12 m; nothing was said."""
+    x, w = np.random.default_rng(2).normal(0.0, 0.1, (2, 5, 3))
+    slopes = []
+    for scale in (1.0, 1e-14):
+        T = np.array([make_pose(exp_so3(a), scale * b) for a, b in zip(w, x, strict=True)])
+        kind = Position(places=scale * PLACES[:1], unknown=("frame", "targets"))
+        evaluated = kind.evaluate(T[None], scale * x[None])
+        assert evaluated.nuisance is not None
+        slopes.append(evaluated.nuisance * np.where(kind._is_length, scale, 1.0) / scale)
+    assert_allclose(slopes[1], slopes[0], atol=1e-15)
+
+
 def test_rows_do_not_grow_with_other_sessions_and_targets() -> None:
     """Columns of all setup parameters would take 5 times the memory for 8 times the sessions."""
     robot, sizes = load_robot("hexapod-42"), {}

@@ -421,6 +421,12 @@ class Kind(ABC):
         """
         return None
 
+    @cached_property
+    def _is_length(self) -> BoolArray:
+        """(u,) which parameters of the kind's own items are lengths."""
+        of_items = (p for item in self.own_items.values() for p in item.parameters)
+        return np.array([p.dimension is Dimension.LENGTH for p in of_items], dtype=bool)
+
     def without_shared_errors(self) -> Self:
         """Return the kind without common errors of the instrument."""
         return replace(cast(Any, self), unknown=tuple(self.own_items))
@@ -610,12 +616,16 @@ class Kind(ABC):
         result = self._evaluate(T, measured.reference, values, joints)
         if result.nuisance is not None:
             # Derivatives by the place of a target cancel between parallel poses: what is rounding
-            # beside the derivative by the twist is zero. A meter is compared with a radian there;
-            # the tolerance is so small that the size of a machine does not matter.
-            by_twist = np.linalg.norm(result.jacobian, axis=-1)
-            by_twist = by_twist.sum(axis=-2) if self.poses_per_row > 1 else by_twist
-            nuisance = without_rounding(result.nuisance, by_twist[..., None])
-            result = result._replace(nuisance=nuisance)
+            # beside the derivative by the twist is zero. Radians count as moves of the largest
+            # distance from the base, whatever the size of a machine.
+            by_angle, by_length = (
+                np.linalg.norm(part, axis=-1) for part in np.split(result.jacobian, 2, axis=-1)
+            )
+            reach = float(np.abs(T[..., :3, 3]).max(initial=0.0)) or 1.0
+            by_move = np.hypot(by_angle / reach, by_length)
+            by_move = by_move.sum(axis=-2) if self.poses_per_row > 1 else by_move
+            size = by_move[..., None] * np.where(self._is_length, 1.0, reach)
+            result = result._replace(nuisance=without_rounding(result.nuisance, size))
         if self.of:  # rows of a stage depend on its platform, those of the base on no motion
             by_entries = (
                 None if self.is_of_base else result.jacobian @ geometry.differentiate_by_entries(T)
