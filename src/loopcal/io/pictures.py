@@ -360,7 +360,12 @@ def examine_picture(task: PictureTask) -> Picture:
             fault = report_finding("pictures.few-corners", found=len(corners), least=least)
     elif blur > task.most_blur:
         fault = report_finding("pictures.blurred", blur=round(blur, 1), limit=task.most_blur)
-    thumbnail = _draw_thumbnail(cv2, gray, pixels)
+    scale = min(1.0, THUMBNAIL / gray.shape[1])
+    shown = max(1, round(scale * gray.shape[1])), max(1, round(scale * gray.shape[0]))
+    small = cv2.cvtColor(cv2.resize(gray, shown, interpolation=cv2.INTER_AREA), cv2.COLOR_GRAY2BGR)
+    for u, v in scale * pixels:
+        cv2.circle(small, (round(u), round(v)), 4, (0, 90, 230), 1, cv2.LINE_AA)
+    thumbnail = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, 75])[1].tobytes()
     return Picture(task.path, size, focal, corners, pixels, blur, fault, thumbnail)
 
 
@@ -404,9 +409,10 @@ def find_corners(cv2: Any, gray: Any, board: Board) -> tuple[IntArray, FloatArra
         return np.zeros(0, dtype=np.intp), np.zeros((0, 2))
     corners, pixels = corners.ravel().astype(np.intp), pixels.reshape(-1, 2).astype(float)
     # once more in a window without the markers; blurred, because steps between pixels mislead
-    step = measure_spacing(board, corners, pixels)
-    if np.isfinite(step):
-        window = int(np.clip(0.1 * step, 2, 20))
+    pairs = _pair_neighbors(board, corners)
+    gaps = np.concatenate([np.linalg.norm(pixels[b] - pixels[a], axis=1) for a, b in pairs])
+    if len(gaps):
+        window = int(np.clip(0.1 * gaps.min(), 2, 20))
         criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-3)
         smooth = cv2.GaussianBlur(gray.astype(np.float32), (0, 0), 1.0)
         start = pixels.astype(np.float32).reshape(-1, 1, 2)
@@ -424,13 +430,6 @@ def _pair_neighbors(board: Board, corners: IntArray) -> list[tuple[IntArray, Int
     pairs = ((grid[:, :-1], grid[:, 1:]), (grid[:-1], grid[1:]))
     found = [(a.ravel(), b.ravel()) for a, b in pairs]
     return [(a[(a >= 0) & (b >= 0)], b[(a >= 0) & (b >= 0)]) for a, b in found]
-
-
-def measure_spacing(board: Board, corners: IntArray, pixels: FloatArray) -> float:
-    """Return the smallest distance of neighboring corners [px]; NaN without neighbors."""
-    pairs = _pair_neighbors(board, corners)
-    gaps = np.concatenate([np.linalg.norm(pixels[b] - pixels[a], axis=1) for a, b in pairs])
-    return float(gaps.min()) if len(gaps) else float("nan")
 
 
 def measure_blur(cv2: Any, gray: Any, board: Board, corners: IntArray, pixels: FloatArray) -> float:
@@ -460,16 +459,6 @@ def measure_blur(cv2: Any, gray: Any, board: Board, corners: IntArray, pixels: F
         sigma = height / np.maximum(slope, 1e-9) / np.sqrt(2.0 * np.pi)
         found.append(float(np.median(sigma)))
     return max(found, default=float("nan"))
-
-
-def _draw_thumbnail(cv2: Any, gray: Any, pixels: FloatArray) -> bytes:
-    """Return a small JPEG with rings around the corners."""
-    scale = min(1.0, THUMBNAIL / gray.shape[1])
-    size = max(1, round(scale * gray.shape[1])), max(1, round(scale * gray.shape[0]))
-    small = cv2.cvtColor(cv2.resize(gray, size, interpolation=cv2.INTER_AREA), cv2.COLOR_GRAY2BGR)
-    for u, v in scale * pixels:
-        cv2.circle(small, (round(u), round(v)), 4, (0, 90, 230), 1, cv2.LINE_AA)
-    return cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, 75])[1].tobytes()
 
 
 def compare_pictures(pictures: Sequence[Picture]) -> tuple[Picture, ...]:

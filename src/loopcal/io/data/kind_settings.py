@@ -854,8 +854,23 @@ def read_observations(
 def _read_entry(
     file: YamlFile, node: Mapping[str, Any], robot: Mechanism, place: Location, rows: IntArray
 ) -> KindRows:
-    """Return the kind of some rows, from the settings at a place of the file."""
-    kind = _read_robot_kind(file, node, robot, place)
+    """Return the kind of some rows, from the settings at a place of the file, mounted on the
+    robot's tool; refuse what it cannot measure.
+    """
+    from loopcal.measure.data_checks import check_kinds
+    from loopcal.measure.kinds.kind import BASE
+
+    kind = read_kind(file, node, place).with_tool(robot.tool)
+    stages = [stage.name for stage in robot.stages]
+    if kind.of and not kind.is_of_base and kind.of not in stages:
+        known = f"a stage ({', '.join(stages)}), or base" if stages else "base"
+        hint = suggest_names(kind.of, [*stages, BASE])
+        sentence = f"{robot.name!r} has no stage {kind.of!r}{hint}; `of` is {known}"
+        raise file.error(sentence, (*place, "of"))
+    try:
+        check_kinds(robot, (kind,))
+    except DataError as error:
+        raise file.error(error.args[0], (*place, "kind")) from None
     allowed = ["kind", *KIND_SETTINGS] if place else SETTINGS
     refuse_unknown_keys(file, list(node), [*allowed, *list_kind_settings(type(kind))], place)
     kind, of_mpe, shared = read_shared_errors(file, node, kind, place)
@@ -871,28 +886,6 @@ def _read_entry(
         instrument = read_instrument(file, file.content, ())
     assumed = bool(source == ASSUMED)
     return KindRows(kind, noise, rows, place, assumed, shared, instrument, sizes)
-
-
-def _read_robot_kind(
-    file: YamlFile, node: Mapping[str, Any], robot: Mechanism, place: Location
-) -> Kind:
-    """Return a kind of the settings, mounted on the robot's tool; refuse what it cannot measure."""
-    from loopcal.measure.data_checks import check_kinds
-    from loopcal.measure.kinds.kind import BASE
-
-    kind = read_kind(file, node, place).with_tool(robot.tool)
-    stages = [stage.name for stage in robot.stages]
-    if kind.of and not kind.is_of_base and kind.of not in stages:
-        known = f"a stage ({', '.join(stages)}), or base" if stages else "base"
-        sentence = (
-            f"{robot.name!r} has no stage {kind.of!r}{suggest_names(kind.of, [*stages, BASE])}"
-        )
-        raise file.error(f"{sentence}; `of` is {known}", (*place, "of"))
-    try:
-        check_kinds(robot, (kind,))
-    except DataError as error:
-        raise file.error(error.args[0], (*place, "kind")) from None
-    return kind
 
 
 def _select_by_settings(table: Table, kinds: tuple[KindRows, ...]) -> tuple[KindRows, ...]:

@@ -327,7 +327,15 @@ def read_profile(path: str | Path) -> Profile:
     record = read_record(file, file.content, ProfileRecord, None)
     if "format" in file.content:
         check_format(file, FORMAT)
-    kind = _read_kind(file, record)
+    kind, place, keys = None, ("settings",), list(record.settings)
+    if "kind" in record.settings or not record.readings:
+        kind = read_kind(file, record.settings, place)
+        allowed = [key for key in SETTINGS if key != "kinds"]
+        refuse_unknown_keys(file, keys, [*allowed, *list_kind_settings(type(kind))], place)
+    else:  # a table that only holds readings of named poses
+        refuse_unknown_keys(file, keys, POSE_SETTINGS, place)
+        if "pose" not in record.columns:
+            raise file.error(report_finding("files.readings-without-poses"), ("columns",))
     if DELIMITERS[record.delimiter] == DECIMALS[record.decimal]:
         sentence = "a comma cannot be both the decimal mark and the separator. Correct one"
         raise file.error(sentence, ("decimal",))
@@ -356,25 +364,17 @@ def read_profile(path: str | Path) -> Profile:
     return profile
 
 
-def _read_kind(file: YamlFile, record: ProfileRecord) -> Kind | None:
-    """Return the kind of the settings; None for a table that only holds readings of named poses."""
-    place, keys = ("settings",), list(record.settings)
-    if "kind" in record.settings or not record.readings:
-        kind = read_kind(file, record.settings, place)
-        allowed = [key for key in SETTINGS if key != "kinds"]
-        refuse_unknown_keys(file, keys, [*allowed, *list_kind_settings(type(kind))], place)
-        return kind
-    refuse_unknown_keys(file, keys, POSE_SETTINGS, place)
-    if "pose" not in record.columns:
-        raise file.error(report_finding("files.readings-without-poses"), ("columns",))
-    return None
-
-
 def check_columns(profile: Profile) -> None:
     """Raise FileError for columns that a measurement file of this kind cannot have, or lacks."""
     file, record = profile.file, profile.record
     measured = profile.measured[-3:] if record.matrix else profile.measured
-    dimensions = _list_dimensions(profile)
+    # of the columns of a kind, of sigma and (two) of covariances
+    dimensions: dict[str, tuple[Dimension, ...]] = {}
+    if kind := profile.kind:
+        of = {profile.strip_target(c.name): c.dimension for c in kind.noise_columns}
+        dimensions = {profile.strip_target(c.name): (c.dimension,) for c in kind.columns}
+        dimensions |= {SIGMA + name: (d,) for name, d in of.items()}
+        dimensions |= {f"{COVARIANCE}{a}.{b}": (of[a], of[b]) for a, b in permutations(of, 2)}
     subject = (
         "a table of readings (without a kind)"
         if profile.kind is None
@@ -410,18 +410,6 @@ def check_columns(profile: Profile) -> None:
         sentence = "the kind has several targets, each with a separate line"
         act = "Add (?P<target>..) to 'match' of 'pose', or {target} to names in 'from'"
         raise file.error(f"{sentence}. {act}", ("columns", "pose"))
-
-
-def _list_dimensions(profile: Profile) -> dict[str, tuple[Dimension, ...]]:
-    """Return the dimensions of the columns of a kind, of sigma and (two) of covariances."""
-    if profile.kind is None:
-        return {}
-    noise = {profile.strip_target(c.name): c.dimension for c in profile.kind.noise_columns}
-    return {
-        **{profile.strip_target(c.name): (c.dimension,) for c in profile.kind.columns},
-        **{SIGMA + name: (d,) for name, d in noise.items()},
-        **{f"{COVARIANCE}{a}.{b}": (noise[a], noise[b]) for a, b in permutations(noise, 2)},
-    }
 
 
 def _check_source(

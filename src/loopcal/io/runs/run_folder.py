@@ -195,20 +195,9 @@ def read_result(path: Path) -> dict[str, Any]:
         plain = json.loads(_SURROGATE.sub("?", text))
     file = YamlFile(path, "", plain)
     stated = read_record(file, plain, get_record(), None, word=report_damage)
-    if problem := _find_contradiction(stated.expected_error):
-        raise report_damage(path, problem)
-    return content
-
-
-def report_damage(path: Path, problem: str) -> FileError:
-    """Return the error of a file of a run that is damaged; `problem` says how."""
-    return FileError(report_finding("files.run-damaged", problem=problem), path)
-
-
-def _find_contradiction(budget: Any) -> str | None:
-    """Return what of the budget of a result cannot be true; None where everything can."""
-    if budget is None:
-        return None
+    if (budget := stated.expected_error) is None:
+        return content
+    # errors are sizes, and each table has the worst parameter
     tables = {"expected_error.parameters": budget.parameters}
     numbers = [budget.position.rms, budget.orientation.rms]
     for i, source in enumerate(budget.sources or ()):
@@ -217,12 +206,18 @@ def _find_contradiction(budget: Any) -> str | None:
         numbers += () if source.halved is None else astuple(source.halved)
     for name, table in tables.items():
         if budget.worst_parameter and budget.worst_parameter not in table:
-            return f"{name!r} lacks the worst parameter {budget.worst_parameter!r}"
+            problem = f"{name!r} lacks the worst parameter {budget.worst_parameter!r}"
+            raise report_damage(path, problem)
         numbers += table.values()
-    for number in numbers:
-        if number is not None and not 0.0 <= number < LARGEST:
-            return f"'expected_error' is {number:g}, which is not a size of an error"
-    return None
+    for wrong in (n for n in numbers if n is not None and not 0.0 <= n < LARGEST):
+        problem = f"'expected_error' is {wrong:g}, which is not a size of an error"
+        raise report_damage(path, problem)
+    return content
+
+
+def report_damage(path: Path, problem: str) -> FileError:
+    """Return the error of a file of a run that is damaged; `problem` says how."""
+    return FileError(report_finding("files.run-damaged", problem=problem), path)
 
 
 # The arrays of a run folder: an archive of NumPy's, read without trust in what it says of itself.

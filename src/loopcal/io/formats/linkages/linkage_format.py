@@ -547,17 +547,26 @@ def describe_robot(mechanism: Linkage, paths: StagePaths, frame: str) -> Content
         return _describe_limbs(mechanism, paths.stages[0]) | ending
     carriers = [np.eye(4), *(geometry.invert_pose(stage.frame) for stage in paths.stages[:-1])]
     named = zip(list_stage_names(mechanism, paths), paths.stages, strict=True)
-    stages = [
-        {
-            "name": name,
-            **(
-                {"joint": _describe_joint(tree, stage, before)}
-                if isinstance(stage, SerialStage)
-                else _describe_loop(mechanism, stage, before)
-            ),
+    stages: list[Content] = []
+    # `before` is the body that carries a stage in the platform of the stage before
+    for (name, stage), before in zip(named, carriers, strict=True):
+        if isinstance(stage, ClosedStage):
+            mount = _describe_moved("mount", before @ stage.mount)
+            loops = _describe_limbs(mechanism, stage)
+            stages.append({"name": name, **mount, "family": "limbs", **loops})
+            continue
+        joint, tip = stage.joint, geometry.invert_pose(stage.joint.T_b) @ stage.frame
+        driven = {
+            "kind": joint.kind,
+            "at": describe_pose(before @ joint.T_a),
+            "axis": _clear(joint.axis),
+            **_describe_moved("tip", tip),
+            "drive": joint.drive,
+            "start": stage.start,
+            **_describe_stroke(tree.joints[joint.drive]),
+            "errors": [*joint.shifts, "offset"],
         }
-        for (name, stage), before in zip(named, carriers, strict=True)
-    ]
+        stages.append({"name": name, "joint": driven})
     controlled = _choose_coordinates(
         paths.graph, paths.home, paths.platform, paths.stages[-1].frame
     )
@@ -628,34 +637,6 @@ def _describe_limbs(mechanism: Linkage, stage: ClosedStage) -> Content:
         "limbs": [limb for limb, _ in limbs],
         **({"parameters": parameters} if parameters else {}),
         "home": describe_pose(paths.locate(paths.platform) @ T_body_frame),
-    }
-
-
-def _describe_loop(mechanism: Linkage, stage: ClosedStage, T_frame_body: FloatArray) -> Content:
-    """Return a stage with closed loops.
-
-    T_frame_body (4, 4) is the body that carries it in the platform of the stage before.
-    """
-    mount = T_frame_body @ stage.mount
-    return {
-        **_describe_moved("mount", mount),
-        "family": "limbs",
-        **_describe_limbs(mechanism, stage),
-    }
-
-
-def _describe_joint(tree: LinkTree, stage: SerialStage, T_frame_body: FloatArray) -> Content:
-    """Return a driven joint; arguments as those of `_describe_loop`."""
-    joint, tip = stage.joint, geometry.invert_pose(stage.joint.T_b) @ stage.frame
-    return {
-        "kind": joint.kind,
-        "at": describe_pose(T_frame_body @ joint.T_a),
-        "axis": _clear(joint.axis),
-        **_describe_moved("tip", tip),
-        "drive": joint.drive,
-        "start": stage.start,
-        **_describe_stroke(tree.joints[joint.drive]),
-        "errors": [*joint.shifts, "offset"],
     }
 
 
