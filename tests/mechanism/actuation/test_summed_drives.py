@@ -513,7 +513,7 @@ SECOND, THIRD = "q2: {reads: length, sum: {m: 1, k: 2}}", "q3: {reads: length, s
         (SECOND, "q2: {reads: length, sum: {m: 1, kk: 2}}", "names 'kk', which is neither", 9),
         (SECOND, "q2: {reads: length, sum: {m: 1, h: 2}}", "'k' of limb 'K' is in no sum", 8),
         (SECOND, "q2: {reads: length, sum: {m: 2, n: 2}}\n  k: {reads: length}",
-         "singular: the sum of actuator 'q2' follows", 9),
+         "'q2' has a sum that follows from q1", 9),
         (SECOND, "q2: {reads: length, sum: {m: 0, k: 0}}", "no weight other than 0", 9),
         (SECOND, "q2: {reads: length, sum: {m: 1, k: .inf}}", "is inf. Write a finite number", 9),
         (SECOND, "q2: {reads: length, sum: [m, k]}",

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
@@ -58,20 +59,25 @@ MOST_POINTS = 200
 SKEW = "skew"
 
 
-class DriveError(RecordError):
-    """An impossible drive; `name` is the one under which a file states it."""
+class RowRecord:
+    """A drive or coupling: the section of the file that lists it, and what messages call it."""
 
-    def __init__(self, sentence: str, name: str) -> None:
-        super().__init__(sentence, "drives", name)
+    SECTION: ClassVar[str] = "drives"
+    WORD: ClassVar[str] = "actuator"
+
+    @classmethod
+    def refuse(cls, name: str, sentence: str) -> RecordError:
+        """Return the error of an impossible one; the sentence begins behind its name."""
+        return RecordError(f"{cls.WORD} {name!r} {sentence}", cls.SECTION, name)
 
 
-class StrokeError(DriveError):
+class StrokeError(RecordError):
     """Strokes of triangle drives with lengths of no angle; `strokes` has their sentences."""
 
     def __init__(self, strokes: Mapping[str, str]) -> None:
         what = "strokes" if len(strokes) > 1 else "stroke"
         sentence = "; ".join([*strokes.values(), f"correct the {what} or the anchors"])
-        super().__init__(sentence, next(iter(strokes)))
+        super().__init__(sentence, "drives", next(iter(strokes)))
         self.strokes = strokes
 
 
@@ -97,7 +103,7 @@ class Triangle:
 
 
 @dataclass(frozen=True, kw_only=True)
-class DriveRecord:
+class DriveRecord(RowRecord):
     """What every drive can state: its reading, with `stroke`, `period` per turn of the harmonics
     and standard deviation `sigma`; the known terms of what it gives, and which are `unknown`.
 
@@ -109,8 +115,6 @@ class DriveRecord:
     (`interpolation`); its unknown values are table1, table2, .., or table for all.
     """
 
-    SECTION: ClassVar[str] = "drives"
-    WORD: ClassVar[str] = "actuator"
     READING: ClassVar[Dimension] = Dimension.LENGTH
     GIVEN: ClassVar[Dimension] = Dimension.LENGTH
 
@@ -271,7 +275,7 @@ class LoadFrame:
 
 
 @dataclass(frozen=True, kw_only=True)
-class CouplingRecord(Sum):
+class CouplingRecord(Sum, RowRecord):
     """What every coupling can state."""
 
     SECTION: ClassVar[str] = "couplings"
@@ -526,18 +530,13 @@ def row_errors(
         chosen = [stated] if stated in terms else whole
         if not chosen:
             hint = f"{suggest_names(stated, list(terms))}. Allowed: {', '.join(terms)}"
-            sentence = f"{row.drive.WORD} {name!r} has no term {stated!r}{hint}"
-            raise RecordError(sentence, row.drive.SECTION, name)
+            raise row.drive.refuse(name, f"has no term {stated!r}{hint}")
         for term in chosen:
             dimension, nominal, tolerance, changes, positive = terms[term]
             parameter = f"{name}.{term}"
             if not changes:
-                raise RecordError(
-                    f"{parameter} rotates the triangle about the joint's own axis, which changes "
-                    "no length. Leave it out",
-                    row.drive.SECTION,
-                    name,
-                )
+                sentence = f"has {term}, which rotates its triangle about the joint's own axis and"
+                raise row.drive.refuse(name, f"{sentence} changes no length. Leave it out")
             sd = spread.select(dimension) if spread else standard_deviation(tolerance, parameter)
             maps = [
                 LinearMap(parameter, Address(name, "transmission", axis), change)
@@ -638,10 +637,8 @@ def place_rows(
     refuse_idle_drives(stated, drives, groups.union(sums))
     used = {joint for row in (*coupled.values(), *drives.values()) for joint in row.weights}
     if used:
-        known_rows = {name: drives[name].weights or {name: 1.0} for name in drives}
-        known_rows |= {name: row.weights for name, row in coupled.items()}
         driven = {name: of.limb for name, of in joints.items() if name in used or not of.is_passive}
-        _check_rows(known_rows, driven)
+        _check_rows({**drives, **coupled}, driven)
     if strokes := {name: words for name in drives if (words := _word_stroke(drives[name]))}:
         raise StrokeError(strokes)
 
@@ -691,19 +688,13 @@ def _find_reference(key: str, coupling: Coupling, conditions: Mapping[str, Condi
     """Return the reference of the condition of a coupling, 0 for none."""
     name = coupling.condition
     if name in FORCES:
-        raise RecordError(
-            f"coupling {key!r} names {name!r}, but a load acts through drives. Give the "
-            "`compliance:` of a drive",
-            "couplings",
-            key,
+        sentence = (
+            f"names {name!r}, but a load acts through drives. Give the `compliance:` of a drive"
         )
+        raise coupling.refuse(key, sentence)
     if name and name not in conditions:
-        raise RecordError(
-            f"coupling {key!r} names the condition {name!r}, which the file does not state"
-            f"{suggest_names(name, list(conditions))}. Add it to `conditions:`",
-            "couplings",
-            key,
-        )
+        hint = f"which the file does not state{suggest_names(name, list(conditions))}"
+        raise coupling.refuse(key, f"names the condition {name!r}, {hint}. Add it to `conditions:`")
     return conditions[name].reference if name else 0.0
 
 
@@ -716,16 +707,14 @@ def _name_joints(
     """Yield name and driven joints of a sum, or those of all copies. known : name in the file ->
     names of driven joints.
     """
-
-    def refuse(sentence: str) -> RecordError:
-        return RecordError(f"{stated.WORD} {key!r} {sentence}", stated.SECTION, key)
-
-    weights: dict[str, float] = {}
+    weights, refuse = dict[str, float](), partial(stated.refuse, key)
     names = [alias for part in list_parts(stated) for alias, _ in part.items]
     for part in list_parts(stated):
         for alias, weight in part.items:
             if names.count(alias) > 1:
-                raise refuse(f"has {alias!r} under both `sum:` and `radius:`. List it once")
+                raise stated.refuse(
+                    key, f"has {alias!r} under both `sum:` and `radius:`. List it once"
+                )
             if alias not in known:
                 raise refuse(
                     f"names {alias!r}, which is neither a drive nor a joint of a limb"
@@ -740,7 +729,9 @@ def _name_joints(
                     else f"adds lengths, but {alias!r} turns. {remedy}"
                 )
             if not np.isfinite(weight):
-                raise refuse(f"gives {alias!r} the weight {weight:g}. Give a finite number")
+                raise stated.refuse(
+                    key, f"gives {alias!r} the weight {weight:g}. Give a finite number"
+                )
             weights[alias] = weight
     if not any(weights.values()):
         raise refuse("has no weight other than 0, so it states nothing. Give one")
@@ -754,34 +745,32 @@ def _name_joints(
         yield f"{key}{i + 1}" if count else key, own
 
 
-def _check_rows(sums: Mapping[str, Mapping[str, float]], known: Mapping[str, str]) -> None:
-    """Refuse sums, readings and couplings by name with the weights of their joints, that leave a
-    driven joint out or repeat each other. known : driven joint -> its limb.
+def _check_rows(rows: Mapping[str, PlacedRow], known: Mapping[str, str]) -> None:
+    """Refuse readings and couplings that leave a driven joint out or repeat each other. known :
+    driven joint -> its limb.
     """
+    sums = {name: row.weights or {name: 1.0} for name, row in rows.items()}
     read = {joint for weights in sums.values() for joint, w in weights.items() if w != 0.0}
     unread = [joint for joint in known if joint not in read]
     if unread:
-        raise DriveError(
+        raise RecordError(
             f"joint {unread[0]!r} of limb {known[unread[0]]!r} is in no sum, so its readings are "
             f"missing. Add it to a `sum:`, or list {unread[0]!r} among the actuators",
+            "drives",
             next(iter(sums)),
         )
     W = np.array([[weights.get(joint, 0.0) for joint in known] for weights in sums.values()])
     a, joints = W.shape
-    if a > joints:
-        raise DriveError(
-            f"{a} readings ({', '.join(sums)}) are sums of {joints} joints "
-            f"({', '.join(known)}). Leave out readings",
-            list(sums)[-1],
-        )
-    for i in range(a):
-        if count_independent(W[: i + 1]) <= i:
-            name = list(sums)[i]
-            raise DriveError(
-                f"the weights of the sums are singular: the sum of actuator {name!r} follows from "
-                f"{', '.join(list(sums)[:i])}. Correct a weight",
+    for i, (name, row) in enumerate(rows.items()):
+        if a > joints and i + 1 == a:
+            raise row.drive.refuse(
                 name,
+                f"is one of {a} readings ({', '.join(sums)}) that are sums of {joints} joints "
+                f"({', '.join(known)}). Leave out readings",
             )
+        if count_independent(W[: i + 1]) <= i:
+            sentence = f"has a sum that follows from {', '.join(list(sums)[:i])}"
+            raise row.drive.refuse(name, f"{sentence}: the weights are singular. Correct a weight")
 
 
 def _word_stroke(placed: PlacedRow) -> str:
@@ -808,17 +797,16 @@ def refuse_idle_drives(
     used, known = tuple(used), {*used, *groups}
     for name in stated:
         if name not in known:
-            raise DriveError(
-                f"actuator {name!r} drives no joint{suggest_names(name, sorted(known))}. Write "
-                f"'actuated: {name}' at one, or leave it out"
-                + (f". {', '.join(used)} drive joints" if used else ""),
+            raise DriveRecord.refuse(
                 name,
+                f"drives no joint{suggest_names(name, sorted(known))}. Write 'actuated: {name}' "
+                "at one, or leave it out" + (f". {', '.join(used)} drive joints" if used else ""),
             )
 
 
 def _check_drive(placed: PlacedRow, drive: Drive) -> None:
     """Refuse a drive whose transmission does not give what its joint does, and a term that is
-    stated or unknown and cannot be (DriveError).
+    stated or unknown and cannot be (RecordError).
     """
     name, turns = placed.name, placed.joint.turns
     if not placed.joints and turns != (
@@ -829,27 +817,21 @@ def _check_drive(placed: PlacedRow, drive: Drive) -> None:
             if turns
             else ("slides", "reads: length, or reads: angle with a radius")
         )
-        raise DriveError(f"actuator {name!r} drives a joint that {motion}. Give {allowed}", name)
+        raise drive.refuse(name, f"drives a joint that {motion}. Give {allowed}")
     stated = {term for term in ("curve", *HARMONICS) if getattr(drive, term)} | {*drive.unknown}
     for term in HARMONICS:
         if term in stated and not drive.period:
-            raise DriveError(
-                f"actuator {name!r} has {term}, but no period. Give the reading's period", name
-            )
+            raise drive.refuse(name, f"has {term}, but no period. Give the reading's period")
     if "curve" in stated and not np.isfinite(placed.list_terms()["curve"].maps["curve"]):
-        raise DriveError(
-            f"actuator {name!r} has a curve, the deviation at the far end of its stroke, but no "
-            "stroke. Give the stroke",
-            name,
-        )
+        sentence = "has a curve, the deviation at the far end of its stroke, but no stroke"
+        raise drive.refuse(name, f"{sentence}. Give the stroke")
     if drive.compliance < 0.0:
-        raise DriveError(f"the compliance of actuator {name!r} is negative. Give its size", name)
+        raise drive.refuse(name, "has a negative compliance. Give its size")
     if "compliance" in drive.unknown and drive.compliances is None:
-        raise DriveError(
-            f"the compliance of actuator {name!r} is unknown. Give `compliances:`, the tolerance "
-            "of its given value",
-            name,
+        sentence = (
+            "has an unknown compliance. Give `compliances:`, the tolerance of its given value"
         )
+        raise drive.refuse(name, sentence)
     if drive.table:
         _check_table(placed, drive)
 
@@ -858,22 +840,16 @@ def _check_table(placed: PlacedRow, drive: Drive) -> None:
     """Refuse a table of one point, out of order, or with which a reading has two joint values."""
     name, points = placed.name, np.array([reading for reading, _ in drive.table])
     if not 2 <= len(points) <= MOST_POINTS or not (np.diff(points) > 0.0).all():
-        raise DriveError(
-            f"the table of actuator {name!r} has {len(points)} points. Give 2 to {MOST_POINTS} "
-            "rows [reading, value], the readings growing",
-            name,
-        )
+        rows = f"Give 2 to {MOST_POINTS} rows [reading, value], the readings growing"
+        raise drive.refuse(name, f"has a table of {len(points)} points. {rows}")
     share = np.linspace(0.0, 1.0, 9)[:-1]
     own = [replace(placed.actuator, terms=placed.law)]
     readings = np.append(points[:-1, None] + share * np.diff(points)[:, None], points[-1])
     values = evaluate_sums(readings[None, :, None], nominal_terms(own)[None], list_constants(own))
     steps = np.diff(values[0, :, 0])
     if not ((steps > 0.0).all() or (steps < 0.0).all()):
-        raise DriveError(
-            f"the table of actuator {name!r} turns its joint back, so two readings have one "
-            "joint value. Correct a value, or give the gain",
-            name,
-        )
+        sentence = "has a table that turns its joint back, so two readings have one joint value"
+        raise drive.refuse(name, f"{sentence}. Correct a value, or give the gain")
 
 
 # Triangles: a linear actuator between two anchors beside a rotary joint.
@@ -896,18 +872,15 @@ def place_triangle(
     low, high = (float(end) for end in compute_range(terms))
     # b of l^2 = a - b cos(theta - gamma) is twice the product of both levers
     if not high**2 - low**2 > 4 * ON_AXIS * float((points**2).sum(axis=1).max()):
-        raise DriveError(
-            f"the triangle of actuator {name!r} is degenerate: an anchor is on the axis of the "
-            "joint, so all angles give one length. Give anchors away from the axis",
-            name,
-        )
+        sentence = "has a degenerate triangle: an anchor is on the axis of the joint, so all angles"
+        raise drive.refuse(name, f"{sentence} give one length. Give anchors away from the axis")
     sine, middle = find_side(start, terms)
     if abs(sine) < DEAD:
-        raise DriveError(
-            f"actuator {name!r} does not turn its joint at {np.rad2deg(start):g} deg, a dead point "
-            "of its triangle: both anchors and the axis are in one plane. Give another "
-            "`start:` of the joint, or other anchors",
+        raise drive.refuse(
             name,
+            f"does not turn its joint at {np.rad2deg(start):g} deg, a dead point of its triangle: "
+            "both anchors and the axis are in one plane. Give another `start:` of the joint, or "
+            "other anchors",
         )
     terms[-2:] = np.sign(sine), middle
     return dict(zip(TRIANGLE_TERMS, (float(term) for term in terms), strict=True))

@@ -235,38 +235,35 @@ class CommonErrorRecord:
         file.
         """
         at = ("common_errors", place)
+
+        def refuse(sentence: str) -> RecordError:
+            return RecordError(f"common error {self.name!r} {sentence}", *at)
+
         stated = {d: t for d in Dimension if (t := getattr(self, d.value, None)) is not None}
         if len(stated) != 1:
-            raise RecordError(
-                f"common error {self.name!r} has {len(stated)} tolerances. Give one, such as "
-                "`length: {sd: 0.1}`",
-                *at,
-            )
+            example = "Give one, such as `length: {sd: 0.1}`"
+            raise refuse(f"has {len(stated)} tolerances. {example}")
         ((dimension, tolerance),) = stated.items()
         sd = standard_deviation(tolerance, f"common error {self.name!r}")
         assert sd is not None
         matching = match_parameter_names(self.of, [p.name for p in parameters], *at, "of")
         chosen = [parameter for parameter in parameters if parameter.name in matching]
         for parameter in chosen:
-            place_of = f"common error {self.name!r} of {parameter.name}"
-            if parameter.dimension is not dimension:
-                raise RecordError(
-                    f"{place_of} states a tolerance of {dimension.value}, but the parameter is of "
-                    f"dimension {parameter.dimension.value}. Use the key "
-                    f"`{parameter.dimension.value}`",
-                    *at,
+            own = parameter.dimension
+            if own is not dimension:
+                raise refuse(
+                    f"of {parameter.name} has a tolerance of {dimension.value}, but the parameter "
+                    f"has the dimension {own.value}. Use the key `{own.value}`"
                 )
             if parameter.tolerance is None:
-                raise RecordError(
-                    f"{place_of}: the parameter has no separate tolerance. Give it, because no two "
-                    "parts are exactly equal",
-                    *at,
+                raise refuse(
+                    f"of {parameter.name}: the parameter has no separate tolerance. Give it, "
+                    "because no two parts are exactly equal"
                 )
         if len(chosen) < 2:
-            raise RecordError(
-                f"common error {self.name!r} belongs to {chosen[0].name} alone. Name two or "
-                f"more parameters, or give the tolerance of that parameter",
-                *at,
+            raise refuse(
+                f"belongs to {chosen[0].name} alone. Name two or more parameters, or give the "
+                "tolerance of that parameter"
             )
         return CommonError(self.name, tuple(parameter.name for parameter in chosen), sd)
 
