@@ -55,7 +55,7 @@ site: .venv/dev.stamp  ## build the documentation site, build/site/index.html; w
 	$(BIN)/python -m sphinx -q -W --keep-going -c docs -d build/doctrees . build/site
 	$(BIN)/python -m tools.check_site build/site --browser
 
-fuzz: .venv/dev.stamp native  ## run N more random inputs through the command line (N=1000 WORKERS=1 FUZZ=runs/fuzz.json)
+fuzz: .venv/dev.stamp native  ## fuzz the command line with N random inputs (N=1000 WORKERS=1 FUZZ=runs/fuzz.json)
 	@mkdir -p $(dir $(FUZZ))
 	$(BIN)/python -m tools.fuzz --count $(N) --workers $(WORKERS) --add $(FUZZ)
 
