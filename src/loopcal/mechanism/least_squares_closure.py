@@ -12,22 +12,23 @@ their error is about 1e-10 of r, and r is small. J = QR avoids the product J'J:
 
     (Q'dr/du + R^-T (dJ/du)'r) du/dp = -(Q'dr/dp + R^-T (dJ/dp)'r).
 
-Arrays have N rows of poses, each with the limbs one by one. Derivation:
-docs/theory/kinematics.md.
+Rows U dtheta + A y + E de + Q dq are those with every joint driven, so that an engine eliminates
+none. Their columns are the freedoms of all nodes, then all joints, then all displacements. Arrays
+have N rows of poses. Derivation: docs/theory/kinematics.md.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from loopcal import engine, geometry
-from loopcal.engine import ParameterMap, Program, State
-from loopcal.mechanism.limb_rows import expand_map, follow_limb, measure_rod
+from loopcal.engine import Group, ParameterMap, Program, State
+from loopcal.mechanism.limb_rows import divide_limbs, expand_map, follow_limb, measure_rod
 from loopcal.mechanism.states import make_start
-from loopcal.typing import FloatArray
+from loopcal.typing import FloatArray, IntArray
 
 CHUNK = 512
 """Rows differentiated together."""
@@ -42,37 +43,45 @@ SINGULAR = 1e-13
 """Smallest diagonal of R, relative to its largest one, of a pose that has derivatives."""
 
 
-@dataclass(frozen=True, eq=False)
-class _Rows:
-    """N rows: displacements e (N, d), nodes (N, 1, 4, 4), joints of groups (N, 1, k, J + 1).
-
-    program : with every joint driven, so that engines linearize without elimination.
-    """
+class _Rows(NamedTuple):
+    """N rows: nodes (N, 1, 4, 4), all joints, then displacements, x (N, joints + d)."""
 
     program: Program
-    e: FloatArray
     nodes: tuple[FloatArray, ...]
-    joints: tuple[FloatArray, ...]
+    x: FloatArray
 
-    def linearize(self) -> list[engine.Block]:
-        """Return A, E and Q of each group, (N, k, r, columns), with all rows of the endings."""
-        state = make_start(self.nodes[0], self.joints, self.nodes[1:])
-        q = self.program.list_drives(self.joints)
-        blocks = engine.linearize(self.program, self.e, q, state).closure
-        return [engine.Block(*(a[:, 0] for a in (b.U, b.A, b.E, b.Q))) for b in blocks]
+    def list_limbs(self) -> Iterator[tuple[Group, int, IntArray]]:
+        """Yield all limbs: a group, the number in it, and the columns of x."""
+        whole = self.program.with_driven_joints
+        for group, driven in zip(self.program.groups, whole.groups, strict=True):
+            for k, drives in enumerate(driven.actuator.T):
+                first = whole.n_joints + group.columns.start + k * len(group.slots)
+                slots = np.arange(first, first + len(group.slots))
+                yield group, k, np.concatenate([drives[drives >= 0], slots])
 
-    def measure_residual(self, number: int) -> FloatArray:
-        """Return the residual (N, k, r) of a group [m], with all rows of its ending."""
-        group, joints = self.program.groups[number], self.joints[number]
-        own = self.e[:, group.columns].reshape(len(self.e), len(group.limbs), -1)
-        bodies, out = (*self.nodes, np.eye(4)), []  # the base has the number -1
-        for k in range(len(group.limbs)):
-            frames, attachment = follow_limb(group, k, own[:, k], joints[:, :, k])
+    def linearize(self) -> list[FloatArray]:
+        """Return the rows (N, r, M + columns) of each limb by freedoms and its columns of x."""
+        whole, (T, *others), q = self.program.with_driven_joints, self.nodes, self.x[:, None]
+        groups = self.program.groups
+        joints = tuple(np.zeros((len(T), 1, len(g.limbs), len(g.joints) + 1)) for g in groups)
+        start, J = make_start(T, joints, tuple(others)), whole.n_joints
+        blocks = engine.linearize(whole, self.x[:, J:], q[..., :J], start)
+        limbs = divide_limbs(whole, blocks)
+        return [np.concatenate([own.A, own.Q, own.E], axis=3)[:, 0] for own in limbs]
+
+    def measure_residual(self) -> Iterator[FloatArray]:
+        """Yield the residual (N, r) of each limb [m], with all rows of its ending."""
+        bodies, N = (*self.nodes, np.eye(4)), len(self.x)  # the base has the number -1
+        for group, k, columns in self.list_limbs():
+            theta, count = np.zeros((N, 1, len(group.joints) + 1)), len(columns) - len(group.slots)
+            theta[:, 0, :count] = self.x[:, columns[:count]]
+            own = self.x[:, columns[count:]]
+            frames, attachment = follow_limb(group, k, own, theta)
             tip = (bodies[group.on[k]] @ frames[-1])[:, 0]
             end = (bodies[group.to[k]] @ attachment)[:, 0]
             gap = end[:, :3, 3] - tip[:, :3, 3]
             if group.ending == "distance":
-                length = measure_rod(group, k, own[:, k]) + joints[:, 0, k, -1]
+                length = measure_rod(group, k, own) + theta[:, 0, -1]
                 gap = (np.linalg.norm(gap, axis=1) - length)[:, None]
             elif group.ending == "rigid":
                 R = end[:, :3, :3] @ tip[:, :3, :3].swapaxes(1, 2)
@@ -80,33 +89,18 @@ class _Rows:
                 # tan(a / 2) along the axis of a rotation by a
                 gibbs = np.stack(v, axis=1) / (1 + np.trace(R, axis1=1, axis2=2))[:, None]
                 gap = np.concatenate([2 * self.program.size * gibbs, gap], axis=1)
-            out.append(gap)
-        return np.stack(out, axis=1)
+            yield gap
 
-    def move(self, unknown: str, index: int, change: float) -> _Rows:
-        """Return the rows after a change of a freedom, by its number among those of all nodes, of
-        a joint or of a slot of all limbs.
-        """
-        if unknown == "freedom":
-            node, f = self.program.unknown_twists[index]
-            T = self.nodes[node].copy()
-            if f < 3:
-                turn = geometry.exp_so3(change * np.eye(3)[f])
-                T[..., :3, :3] = turn @ T[..., :3, :3]
-            else:
-                T[..., f - 3, 3] += change
-            return replace(self, nodes=(*self.nodes[:node], T, *self.nodes[node + 1 :]))
-        if unknown == "joint":
-            joints = tuple(a.copy() for a in self.joints)
-            for a in joints:
-                if index < a.shape[-1]:
-                    a[..., index] += change
-            return replace(self, joints=joints)
-        e = self.e.copy()
-        for group in self.program.groups:
-            if index < len(group.slots):
-                e[:, group.columns.start + index : group.columns.stop : len(group.slots)] += change
-        return replace(self, e=e)
+    def move(self, columns: Sequence[int], change: float) -> _Rows:
+        """Return the rows after a change of one freedom, or of several columns of x."""
+        twists = self.program.unknown_twists
+        if columns[0] >= len(twists):
+            x = self.x.copy()
+            x[:, np.subtract(columns, len(twists))] += change
+            return self._replace(x=x)
+        (node, f), nodes = twists[columns[0]], list(self.nodes)
+        nodes[node] = geometry.apply_twist(nodes[node], change * np.eye(6)[f])
+        return self._replace(nodes=tuple(nodes))
 
 
 def differentiate_open(
@@ -132,29 +126,31 @@ def differentiate_unknowns(
     nodes, then the joints of `list_unknown_joints`. Arguments are those of
     `loopcal.engine.differentiate`.
     """
-    t, n = state.T.shape[:2]
-    joints = [
-        np.broadcast_to(g.insert_driven(own, q), (t, n, *own.shape[2:]))
-        for g, own in zip(program.groups, state.joints, strict=True)
-    ]
-    count = len(program.unknown_twists) + len(list_unknown_joints(program))
-    out = np.zeros((t * n, count, inputs.pattern.parameters + program.n_joints))
-    displacements, driven = expand_map(program, inputs)
-    displacements = np.pad(displacements, [(0, 0), (0, 0), (0, program.n_joints)])
+    (t, n), whole, p = state.T.shape[:2], program.with_driven_joints, inputs.pattern.parameters
+    values = whole.list_drives(
+        tuple(
+            np.broadcast_to(g.insert_driven(own, q), (t, n, *own.shape[2:]))
+            for g, own in zip(program.groups, state.joints, strict=True)
+        )
+    )
+    drive = np.full(whole.n_joints, -1)  # of each joint
+    for group, driven in zip(program.groups, whole.groups, strict=True):
+        drive[driven.actuator[driven.actuator >= 0]] = group.actuator[driven.actuator >= 0]
+    displacements, joints = expand_map(program, inputs)
     displacements = np.broadcast_to(displacements, (t, *displacements.shape[1:]))
-    driven = np.broadcast_to(driven, (t, n, *driven.shape[2:]))
+    joints = np.broadcast_to(joints, (t, n, *joints.shape[2:]))
+    count = len(program.unknown_twists) + len(list_unknown_joints(program))
+    out = np.zeros((t * n, count, p + program.n_joints))
     for first in range(0, t * n, CHUNK):
         trial, pose = np.divmod(np.arange(first, min(first + CHUNK, t * n)), n)
-        rows = _Rows(
-            program.with_driven_joints,
-            e[trial if len(e) > 1 else 0 * trial],
-            tuple(T[trial, pose][:, None] for T in (state.T, *state.others)),
-            tuple(own[trial, pose][:, None] for own in joints),
-        )
+        own = e[trial if len(e) > 1 else 0 * trial]
+        nodes = tuple(T[trial, pose][:, None] for T in (state.T, *state.others))
+        rows = _Rows(program, nodes, np.concatenate([values[trial, pose], own], axis=1))
+        moved = np.zeros((*rows.x.shape, out.shape[2]))
+        moved[:, np.flatnonzero(drive >= 0)] = joints[trial, pose][:, drive[drive >= 0]]
+        moved[:, len(drive) :, :p] = displacements[trial]
         with np.errstate(all="ignore"):
-            own = _InputMap(displacements[trial], driven[trial, pose])
-            moved = _differentiate_rows(program, rows, own)
-        out[first : first + len(trial)] = moved
+            out[first : first + len(trial)] = _differentiate_rows(rows, moved)
     return out.reshape(t, n, *out.shape[1:])
 
 
@@ -168,118 +164,97 @@ def list_unknown_joints(program: Program) -> list[tuple[int, int]]:
     ]
 
 
-@dataclass(frozen=True, eq=False)
-class _InputMap:
-    """Derivatives by p parameters and a readings: of displacements (N, d, p + a), and of driven
-    joints (N, a, p + a).
+class _Limb(NamedTuple):
+    """The rows of a limb that count: slopes J and dr of `_correct_slopes` (N, r, c) by its columns,
+    and the residual (N, r).
+
+    rows : which of its ending they are. columns : (c,) among all. unknown, places : those that
+        closure determines, in columns and among the unknowns. moved : how many columns inputs or
+        the unknowns move.
     """
 
-    displacements: FloatArray
-    joints: FloatArray
-
-    def select(self, program: Program, number: int, k: int) -> FloatArray:
-        """Return those of the slots and joints of limb k of a group, (N, slots + J + 1, p + a)."""
-        group, width = program.groups[number], len(program.groups[number].slots)
-        first = group.columns.start + k * width
-        columns = group.actuator[:, k]
-        joints = np.where((columns >= 0)[:, None], self.joints[:, columns], 0.0)
-        return np.concatenate([self.displacements[:, first : first + width], joints], axis=1)
+    J: FloatArray
+    dr: FloatArray
+    residual: FloatArray
+    rows: list[int]
+    columns: IntArray
+    unknown: list[int]
+    places: list[int]
+    moved: int
 
 
-def _differentiate_rows(program: Program, rows: _Rows, inputs: _InputMap) -> FloatArray:
-    """Return the unknowns by parameters and readings (N, u, p + a)."""
-    m, N, width = len(program.unknown_twists), len(rows.e), inputs.joints.shape[2]
-    unknown = [g.unknown_joints(False) for g in program.groups]
-    total = m + sum(len(g.limbs) * len(u) for g, u in zip(program.groups, unknown, strict=True))
-    moves_slots = bool(inputs.displacements.any())
-    residuals = [rows.measure_residual(g) for g in range(len(program.groups))]
-    bends = _bend(program, rows, residuals, moves_slots)
-    J, dr, bent, first = [], [], np.zeros((N, total, total + width)), m
-    for number, block in enumerate(rows.linearize()):
-        group, own = program.groups[number], unknown[number]
-        exact = _correct_slopes(program, number, block, residuals[number])
-        for k in range(len(group.limbs)):
-            columns = [*range(m), *range(first, first + len(own))]  # freedoms and unknown joints
-            first += len(own)
-            moved, chosen = inputs.select(program, number, k), list(group.rows)
-
-            def spread(slopes: Iterable[FloatArray]) -> FloatArray:
-                """Return rows by freedoms, slots and joints as rows by all unknowns and inputs."""
-                A, E, Q = slopes
-                out = np.zeros((*A.shape[:2], total + width))
-                out[:, :, columns] = np.concatenate([A, Q[..., own]], axis=2)  # noqa: B023
-                out[:, :, total:] = np.concatenate([E, Q], axis=2) @ moved  # noqa: B023
-                return out
-
-            J.append(spread(a[:, k, chosen] for a in (block.A, block.E, block.Q))[..., :total])
-            dr.append(spread(a[:, k, chosen] for a in exact))
-            bent[:, columns] += spread(a[:, k] for a in bends[number])
-    return _solve(np.concatenate(J, axis=1), np.concatenate(dr, axis=1), bent)
+def _differentiate_rows(rows: _Rows, moved: FloatArray) -> FloatArray:
+    """Return the unknowns by parameters and readings (N, u, p + a), for derivatives of x by them
+    (N, joints + d, p + a).
+    """
+    M, J = len(rows.program.unknown_twists), rows.program.with_driven_joints.n_joints
+    limbs, u, moves_slots = list[_Limb](), M, bool(moved[:, J:].any())
+    of_limbs = zip(rows.list_limbs(), rows.linearize(), rows.measure_residual(), strict=True)
+    for (group, k, own), slopes, residual in of_limbs:
+        passive, counted = group.unknown_joints(False), list(group.rows)
+        exact = _correct_slopes(rows.program, group, k, slopes, residual)
+        columns = np.concatenate([np.arange(M), M + own])
+        unknown = [*range(M), *(M + j for j in passive)]
+        places = [*range(M), *range(u, u + len(passive))]
+        width = len(columns) - (0 if moves_slots else len(group.slots))
+        parts = slopes[:, counted], exact[:, counted], residual[:, counted]
+        limbs.append(_Limb(*parts, counted, columns, unknown, places, width))
+        u += len(passive)
+    bent, (N, _, width) = _bend(rows, limbs, u), moved.shape
+    J, dr, into = [], [], np.zeros((N, u, width))
+    for limb in limbs:
+        own = moved[:, limb.columns[M:] - M]
+        J.append(np.zeros((N, len(limb.rows), u)))
+        dr.append(np.zeros((N, len(limb.rows), u + width)))
+        J[-1][:, :, limb.places] = limb.J[:, :, limb.unknown]
+        dr[-1][:, :, limb.places] = limb.dr[:, :, limb.unknown]
+        dr[-1][:, :, u:] = limb.dr[:, :, M:] @ own
+        into[:, limb.places] += bent[:, limb.places][:, :, limb.columns[M:]] @ own
+    unknown = [column for limb in limbs for column in limb.columns[limb.unknown[M:]]]
+    both = np.concatenate([bent[:, :, [*range(M), *unknown]], into], axis=2)
+    return _solve(np.concatenate(J, axis=1), np.concatenate(dr, axis=1), both)
 
 
 def _correct_slopes(
-    program: Program, number: int, block: engine.Block, residual: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return dr of a group by freedoms, slots and joints (N, k, r, ..), of J.
+    program: Program, group: Group, k: int, J: FloatArray, residual: FloatArray
+) -> FloatArray:
+    """Return dr (N, r, c) of limb k of a group, of J.
 
     J takes the slope of a rotation as if there were no gap. With g = tan(a / 2) along its axis, a
-    rotation d of the platform changes 2 g by d - g x d + g (g'd), one of the tip by d + g x d + g
-    (g'd).
+    rotation d of the body where the limb ends changes 2 g by d - g x d + g (g'd), any other, which
+    turns the tip, by d + g x d + g (g'd).
     """
-    group = program.groups[number]
     if group.ending != "rigid":
-        return block.A, block.E, block.Q
-    gibbs = residual[..., :3] / (2 * program.size)
-    last = len(group.joints) + 1
-    of_slots = np.array([-1.0 if slot.element == last else 1.0 for slot in group.slots])
-
-    def correct(columns: FloatArray, sign: FloatArray | float) -> FloatArray:
-        d = columns[:, :, :3].swapaxes(2, 3)
-        g = gibbs[:, :, None]
-        turned = d + g * (d @ gibbs[..., None])
-        turned += np.cross(np.broadcast_to(g, d.shape), d) * np.reshape(sign, (-1, 1))
-        out = columns.copy()
-        out[:, :, :3] = turned.swapaxes(2, 3)
-        return out
-
-    return correct(block.A, -1.0), correct(block.E, of_slots), correct(block.Q, 1.0)
+        return J
+    at_end = [node == group.to[k] for node, _ in program.unknown_twists]
+    at_end += [False] * (J.shape[2] - len(at_end) - len(group.slots))
+    at_end += [slot.element == len(group.joints) + 1 for slot in group.slots]
+    d, g, out = J[:, :3], residual[:, :3] / (2 * program.size), J.copy()
+    turned = np.where(at_end, -1.0, 1.0) * (geometry.hat(g) @ d)
+    out[:, :3] += turned + g[:, :, None] * (g[:, None] @ d)
+    return out
 
 
-def _bend(
-    program: Program, rows: _Rows, residuals: list[FloatArray], moves_slots: bool
-) -> list[tuple[FloatArray, FloatArray, FloatArray]]:
-    """Return (dJ)'r of each group by freedoms, slots and joints, (N, k, m + u, ..); zero where the
-    loops are closed, and by slots which no input moves.
+def _bend(rows: _Rows, limbs: list[_Limb], u: int) -> FloatArray:
+    """Return (dJ)'r (N, u, columns) of the u unknowns; zero where the loops are closed, and by
+    displacements which no input moves.
     """
-    m, groups, N = len(program.unknown_twists), program.groups, len(rows.e)
-    out = []
-    for group in groups:
-        lead = N, len(group.limbs), m + len(group.unknown_joints(False))
-        widths = m, len(group.slots), len(group.joints) + 1
-        out.append(tuple(np.zeros((*lead, width)) for width in widths))
-    largest = max(np.nanmax(np.abs(r), initial=0.0) for r in residuals)
-    if largest <= CLOSED * program.size:
+    twists, size = rows.program.unknown_twists, rows.program.size
+    out = np.zeros((len(rows.x), u, len(twists) + rows.x.shape[1]))
+    largest = max(np.nanmax(np.abs(limb.residual), initial=0.0) for limb in limbs)
+    if largest <= CLOSED * size:
         return out
-    moves = [("freedom", i, i) for i in range(m)]
-    moves += [("joint", j, j) for j in range(max(len(g.joints) for g in groups) + 1)]
-    if moves_slots:
-        moves += [("slot", i, i) for i in range(max(len(g.slots) for g in groups))]
-    for kind, index, place in moves:
-        part = {"freedom": 0, "slot": 1, "joint": 2}[kind]
+    for i in range(max(limb.moved for limb in limbs)):
+        moving = [limb for limb in limbs if i < limb.moved]
         # one length of the change for all limbs; of a joint an angle counts as its arc
-        is_turn = kind == "freedom" and program.unknown_twists[index][1] < 3
-        change = CHANGE * (1.0 if is_turn else program.size)
-        ahead, behind = (rows.move(kind, index, s * change).linearize() for s in (1, -1))
-        for g, group in enumerate(groups):
-            if place < out[g][part].shape[3]:
-                chosen = list(group.rows)
-                own = group.unknown_joints(False)
-                slopes = [
-                    np.concatenate([b.A[:, :, chosen], b.Q[:, :, chosen][..., own]], axis=3)
-                    for b in (ahead[g], behind[g])
-                ]
-                bent = (slopes[0] - slopes[1]).swapaxes(2, 3) @ residuals[g][:, :, chosen, None]
-                out[g][part][..., place] = bent[..., 0] / (2 * change)
+        change = CHANGE * (1.0 if i < len(twists) and twists[i][1] < 3 else size)
+        columns = sorted({int(limb.columns[i]) for limb in moving})
+        ahead, behind = (rows.move(columns, sign * change).linearize() for sign in (1, -1))
+        for limb, more, less in zip(limbs, ahead, behind, strict=True):
+            if i < limb.moved:
+                slopes = (more - less)[:, limb.rows][:, :, limb.unknown].swapaxes(1, 2)
+                bent = (slopes @ limb.residual[..., None])[..., 0] / (2 * change)
+                out[:, limb.places, limb.columns[i]] += bent
     return out
 
 
