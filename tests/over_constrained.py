@@ -89,6 +89,60 @@ workspace: {x: [-80, 80]}
 """A planar four-bar linkage described in space, with four R joints."""
 
 
+TWO_FOUR_BARS = """format: 1
+family: limbs
+name: two-four-bars
+source: ours
+units: {length: mm, angle: deg}
+controlled: [x, z]
+actuators:
+  q: {reads: angle, stroke: [-60, 60], unknown: [offset], angle: {sd: 0.1}}
+  p: {reads: angle, stroke: [-60, 60], unknown: [offset], angle: {sd: 0.1}}
+bodies:
+  - {name: mid, home: {z: 200}}
+limbs:
+  - name: crank
+    to: mid
+    ending: rigid
+    chain:
+      - {joint: R, name: motor, at: [-150, 0, 0], axis: y, actuated: q, start: 0}
+      - {joint: R, name: upper, at: [0, 0, 200], axis: y, start: 0}
+    attach: [-150, 0, 0]
+    errors:
+      - {of: motor, tilt: [rx, rz], tolerance: {sd: 0.1}}
+      - {of: upper, tilt: [rx, rz], tolerance: {sd: 0.1}}
+  - name: rocker
+    to: mid
+    ending: rigid
+    chain:
+      - {joint: R, name: low, at: [150, 0, 0], axis: y, start: 0}
+      - {joint: R, name: upper, at: [0, 0, 250], axis: y, start: 0}
+    attach: [150, 0, 50]
+    errors:
+      - {of: upper, tilt: [rx, rz], tolerance: {sd: 0.1}}
+  - name: crank2
+    on: mid
+    ending: rigid
+    chain:
+      - {joint: R, name: motor, at: [-100, 0, 0], axis: y, actuated: p, start: 0}
+      - {joint: R, name: upper, at: [100, 0, 150], axis: y, start: 0}
+    attach: [-50, 0, 0]
+    errors:
+      - {of: upper, tilt: [rx, rz], tolerance: {sd: 0.1}}
+  - name: rocker2
+    on: mid
+    ending: rigid
+    chain:
+      - {joint: R, name: low, at: [100, 0, 0], axis: y, start: 0}
+      - {joint: R, name: upper, at: [0, 0, 150], axis: y, start: 0}
+    attach: [150, 0, 0]
+    errors:
+      - {of: upper, tilt: [rx, rz], tolerance: {sd: 0.1}}
+home: {x: 0, z: 350}
+workspace: {x: [-40, 40], z: [340, 350]}
+"""
+"""A four-bar linkage in space on the coupler of another one."""
+
 THREE_RRR = """format: 1
 family: limbs
 name: three-rrr

@@ -36,6 +36,7 @@ from tests.over_constrained import (
     FOUR_BAR,
     RAILS,
     THREE_RRR,
+    TWO_FOUR_BARS,
     close_by_least_squares,
     put_on_wrist,
     solve_exechon,
@@ -44,6 +45,9 @@ from tests.robot_texts import load_text
 from tests.zoo import move_base, place
 
 BOTH = pytest.mark.parametrize("text", [EXECHON, FOUR_BAR], ids=["exechon", "four-bar"])
+OPEN = pytest.mark.parametrize(
+    "text", [EXECHON, FOUR_BAR, TWO_FOUR_BARS], ids=["exechon", "four-bar", "two-four-bars"]
+)
 
 
 def get_data(robot: Mechanism) -> dict:
@@ -173,7 +177,7 @@ def test_forward_kinematics_of_open_loops_returns_commanded_coordinates(text, tm
     assert_allclose(again.q, solution.q, atol=1e-9)
 
 
-@BOTH
+@OPEN
 def test_derivatives_of_open_loops_agree_with_differences(text: str, tmp_path: Path) -> None:
     robot = load_text(tmp_path, close_by_least_squares(text))
     values, q = draw(robot, 3)
@@ -195,7 +199,7 @@ def test_derivatives_of_open_loops_agree_with_differences(text: str, tmp_path: P
         assert_allclose(D.readings[..., i], differ(0 * values[0], unit), atol=2e-7)
 
 
-@BOTH
+@OPEN
 def test_derivatives_of_passive_joints_of_open_loops_agree_with_differences(text, tmp_path):
     robot = load_text(tmp_path, close_by_least_squares(text))
     values, q = draw(robot, 2)
