@@ -28,7 +28,7 @@ from loopcal.mechanism.chains import (
     split_stage_states,
     transport_twists,
 )
-from loopcal.mechanism.kinematics import close_at_joints, compute_closure_sign, solve_serial
+from loopcal.mechanism.kinematics import Loops, compute_closure_sign, solve_serial
 from loopcal.mechanism.limb_rows import measure_rod, move_serial, place_links, place_serial
 from loopcal.mechanism.model import Mechanism, Stage
 from loopcal.mechanism.platform_coordinates import (
@@ -320,7 +320,7 @@ class _Rows:
                     continue
                 if sums is not None:
                     weights, own = sums.weights, sums.complete(own)
-                state = close_at_joints(robot, e, own, next(loops), False, weights=weights)
+                state = Loops(robot, e, weights).close(own, next(loops), follow=False)
                 by_drive = differentiate_by_drives(robot, e, own, state, weights)[:, 0]
                 moved.append((state.T[:, 0], by_drive[..., : sums and sums.chosen]))
                 states.append(state)

@@ -111,9 +111,32 @@ class Loops(NamedTuple):
         goal: State | None = None,
         max_iterations: int = ITERATIONS,
     ) -> State:
-        """Return states (t, n) at joint values or sums (t | 1, n, a)."""
+        """Return states (t, n) at joint values or sums (t | 1, n, a), by Newton's method alone."""
+        if self.robot.is_serial:
+            return solve_serial(self.robot, self.e, values, begin.T.shape[:2])
         given = values, begin, None, False, max_iterations, goal, self.state_sums(values)
         return clear_sign(self.robot, engine.solve(self.robot.program, self.e, *given))
+
+    def close(
+        self,
+        values: FloatArray,
+        start: State | None = None,
+        follow: bool = True,
+        goal: State | None = None,
+    ) -> State:
+        """Solve like `forward_trials` for values of joints or their sums (t | 1, n, a)."""
+        if self.weights is not None and not self.robot.has_open_sums:
+            joints = apply_weights(invert_weights(self.weights), values)
+            return self._replace(weights=None).close(joints, start, follow, goal)
+        begin = clear_sign(self.robot, start or self.robot.home_state)
+        state = self.solve(values, begin, goal)
+        wrong = find_wrong_rows(self.robot, state, begin.closure_sign)
+        if not wrong.any():
+            return state
+        if not follow:
+            beyond = wrong & (state.status == Status.CONVERGED.value)
+            return replace(state, status=np.where(beyond, np.int8(Status.OTHER_MODE), state.status))
+        return follow_path(self, values, begin, state, wrong)
 
     def follow(self, values: FloatArray, begin: State, ends: bool) -> State:
         """Return states (t, n) at joint values or sums (t, n, a) one after the other, from `begin`
@@ -144,16 +167,19 @@ class Loops(NamedTuple):
         return Loops(self.robot, take(self.e), weights)
 
 
-def drive_loops(robot: Mechanism, values: FloatArray, q: FloatArray) -> tuple[Loops, FloatArray]:
+def drive_loops(
+    robot: Mechanism, values: FloatArray, q: FloatArray, driven: DrivenJoints | None = None
+) -> tuple[Loops, FloatArray]:
     """Return the loops of a robot without stages for values (t | 1, p), and its driven joints or
-    open sums (t | 1, n, a) [m, rad] at readings q (t | 1, n, a).
+    open sums (t | 1, n, a) [m, rad] at readings q (t | 1, n, a); `driven` is that of
+    `drive_joints`, where it is known.
     """
-    loops = Loops.place(robot, values)
-    if not robot.has_open_sums:
-        return loops, drive_joints(robot, values, q).joints
-    _, tau = robot.slots(values)
-    with np.errstate(invalid="ignore"):  # as in `drive_joints`
-        return loops, transmit_readings(q, tau, robot.slots.constants)
+    if robot.has_open_sums:
+        _, tau = robot.slots(values)
+        with np.errstate(invalid="ignore"):  # as in `drive_joints`
+            return Loops.place(robot, values), transmit_readings(q, tau, robot.slots.constants)
+    e, _, joints = driven or drive_joints(robot, values, q)
+    return Loops(robot, e, None), joints
 
 
 def follow_path(
@@ -250,13 +276,11 @@ def forward_trials(
             for own in each_stage(robot, values, start or robot.home_state, q)
         ]
         return join_stage_states(robot, states)
-    if robot.has_open_sums:
-        loops, sums = drive_loops(robot, values, q)
-        return close_at_joints(robot, loops.e, sums, start, follow, weights=loops.weights)
-    e, tau, joints = driven or drive_joints(robot, values, q)
-    state = close_at_joints(robot, e, joints, start, follow, goal)
-    if not len(find_triangles(tau)):
+    loops, joints = drive_loops(robot, values, q, driven)
+    state = loops.close(joints, start, follow, goal)
+    if not len(find_triangles(robot.slots.terms[None])):
         return state
+    _, tau = robot.slots(values)
     # a length of a triangle that no angle reaches
     excess = np.broadcast_to(measure_excess(q, tau, robot.slots.constants), state.status.shape)
     is_beyond = (state.status == Status.NOT_FINITE.value) & (excess > 0.0) & np.isfinite(excess)
@@ -265,34 +289,6 @@ def forward_trials(
         status=np.where(is_beyond, np.int8(Status.UNREACHABLE), state.status),
         residual=np.where(is_beyond, excess, state.residual),
     )
-
-
-def close_at_joints(
-    robot: Mechanism,
-    e: FloatArray,
-    joints: FloatArray,
-    start: State | None = None,
-    follow: bool = True,
-    goal: State | None = None,
-    weights: FloatArray | None = None,
-) -> State:
-    """Solve forward kinematics like `forward_trials`, for displacements e (t | 1, d) and values (t
-    | 1, n, J) of the driven joints, or with `weights` (t | 1, a, J) their sums (t | 1, n, a).
-    """
-    begin = clear_sign(robot, start or robot.home_state)
-    if robot.is_serial:
-        return solve_serial(robot, e, joints, begin.T.shape[:2])
-    if weights is not None and not robot.has_open_sums:
-        joints, weights = apply_weights(invert_weights(weights), joints), None
-    loops = Loops(robot, e, weights)
-    state = loops.solve(joints, begin, goal)
-    wrong = find_wrong_rows(robot, state, begin.closure_sign)
-    if not wrong.any():
-        return state
-    if not follow:
-        beyond = wrong & (state.status == Status.CONVERGED.value)
-        return replace(state, status=np.where(beyond, np.int8(Status.OTHER_MODE), state.status))
-    return follow_path(loops, joints, begin, state, wrong)
 
 
 def solve_serial(
@@ -336,8 +332,6 @@ def close_loops(
         ]
         return join_stage_states(robot, states)
     loops, driven = drive_loops(robot, values, q)
-    if robot.is_serial:
-        return solve_serial(robot, loops.e, driven, begin.T.shape[:2])
     return loops.solve(driven, begin, None, max_iterations)
 
 
@@ -356,8 +350,6 @@ def compute_closure_sign(robot: Mechanism, values: FloatArray, state: State) -> 
         parts = each_stage(robot, values, state)
         signs = [compute_closure_sign(own.stage.robot, own.values, own.state) for own in parts]
         return np.multiply.reduce(signs, dtype=np.int8)
-    if robot.is_serial:
-        return np.ones(state.status.shape, np.int8)
     loops = Loops.place(robot, values)
     return loops.solve(loops.read(state), state, max_iterations=0).closure_sign
 

@@ -31,7 +31,6 @@ from loopcal.mechanism.inverse import (
 from loopcal.mechanism.kinematics import (
     Loops,
     clear_sign,
-    close_at_joints,
     compute_closure_sign,
     compute_readings,
     forward_trials,
@@ -316,7 +315,7 @@ def _judge_paths(robot: Mechanism, first: State, goal: State) -> tuple[State, Bo
     readings determine the joints.
     """
     loops = Loops.place(robot, robot.values[None])
-    back = close_at_joints(robot, loops.e, loops.read(goal), first, True, goal, loops.weights)
+    back = loops.close(loops.read(goal), first, goal=goal)
     is_other = back.status[0] != NEAR_GOAL
     is_other &= (back.status[0] != Status.CONVERGED) | ~_is_same_pose(robot, back, goal, SAME_POSE)
     rows = np.flatnonzero(~is_other & (loops.weights is None))
