@@ -131,7 +131,7 @@ class Loops(NamedTuple):
         begin = clear_sign(self.robot, start or self.robot.home_state)
         state = self.solve(values, begin, goal)
         wrong = find_wrong_rows(self.robot, state, begin.closure_sign)
-        if not wrong.any():
+        if self.robot.is_serial or not wrong.any():
             return state
         if not follow:
             beyond = wrong & (state.status == Status.CONVERGED.value)
