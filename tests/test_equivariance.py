@@ -5,6 +5,7 @@ instrument, the units of the file, and the order of poses, limbs and actuators. 
 A new file in src/loopcal/robots is included automatically.
 """
 
+import json
 from dataclasses import fields, is_dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -16,10 +17,14 @@ from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 
 from loopcal import geometry
+from loopcal.apply.calibration import calibrate
+from loopcal.apply.calibration_options import CalibrationOptions
+from loopcal.apply.calibration_report import CalibrationReport
+from loopcal.errors import MechanismError
 from loopcal.estimate.identification import identify
 from loopcal.estimate.options import FitOptions
 from loopcal.io.core.records import get_field_types
-from loopcal.io.robot.robot_file import load_robot
+from loopcal.io.robot.robot_file import list_shipped_robots, load_robot
 from loopcal.measure.instrument import Gaussian, Instrument, Sensor
 from loopcal.measure.kinds.position import Position
 from loopcal.measure.measurements import Measurements
@@ -172,3 +177,72 @@ def test_fit_does_not_depend_on_the_frame_of_the_instrument(name: str) -> None:
 def test_fit_does_not_depend_on_the_order_of_poses(name: str) -> None:
     data = measure_robot(name)
     check_estimate(name, data.take(np.random.default_rng(8).permutation(POSES)))
+
+
+# A whole calibration, with its validation and its verdict.
+
+
+def rotate(axis: int, angle: float) -> Array:
+    return geometry.make_pose(geometry.exp_so3(angle * np.eye(3)[axis]), np.array([1.0, -2.0, 0.5]))
+
+
+BASES = {
+    "upside down": rotate(0, np.pi),
+    "on a wall, where roll and yaw are one angle": rotate(1, np.pi / 2),
+    "turned to the other side": rotate(2, np.pi - 1e-9),
+}
+
+
+@cache
+def calibrate_robot(name: str) -> CalibrationReport:
+    return calibrate(load_cached_robot(name), measure_robot(name), SPLIT)
+
+
+SPLIT = CalibrationOptions(hold_out=0.25)
+
+
+def check_report(name: str, robot: Mechanism, data: Measurements) -> CalibrationReport:
+    """Assert that a calibration gives the numbers and the statements of `measure_robot`."""
+    report, usual = calibrate(robot, data, SPLIT), calibrate_robot(name)
+    fit, expected = report.identification, usual.identification
+    assert_allclose(fit.standard_deviations, expected.standard_deviations, rtol=1e-4)
+    gap = np.abs(fit.estimate - expected.estimate) / expected.standard_deviations
+    assert gap.max() <= SHARE
+    assert report.verdict == usual.verdict
+    assert report.validation is not None
+    assert usual.validation is not None
+    for quantity, change in usual.validation.changes().items():
+        there = report.validation.changes()[quantity]
+        assert_allclose((there.before, there.after), (change.before, change.after), rtol=1e-4)
+    assert [f.code for f in report.findings] == [f.code for f in usual.findings]
+    return report
+
+
+@pytest.mark.parametrize("base", BASES.values(), ids=BASES)
+@pytest.mark.parametrize("name", ["hexapod-42", "ru-pus-prs"])
+def test_calibration_does_not_depend_on_how_the_machine_stands(name: str, base: Array) -> None:
+    """The frame of the tracker is unknown, so the data are the same. Tilt and torsion stay regular
+    where roll and yaw do not.
+    """
+    moved = move_base(load_cached_robot(name).assembly, base)
+    if "roll" in moved.controlled and abs(base[2, 0]) > 0.5:
+        moved = replace(moved, controlled=("x", "y", "z", "phi", "theta", "psi"))
+    check_report(name, build(moved), measure_robot(name))
+
+
+@pytest.mark.parametrize("leg", ["Bein", "\u811a", "q.", "frame"])
+def test_calibration_does_not_depend_on_the_names_of_limbs(leg: str, tmp_path: Path) -> None:
+    text = list_shipped_robots()["3-rps"].read_text("utf-8")
+    file = tmp_path / "robot.yaml"
+    file.write_text(text.replace("name: leg", f"name: {json.dumps(leg)}"), "utf-8")
+    report = check_report("3-rps", load_robot(file), measure_robot("3-rps"))
+    assert report.identification.names[0].startswith(leg)
+
+
+def test_coordinates_that_are_singular_at_home_are_refused_by_name() -> None:
+    """Roll and yaw on a wall, and torsion upside down."""
+    assembly = load_cached_robot("hexapod-42").assembly
+    tilted = replace(assembly, controlled=("x", "y", "z", "phi", "theta", "psi"))
+    for robot, base in ((assembly, list(BASES.values())[1]), (tilted, rotate(0, np.pi))):
+        with pytest.raises(MechanismError, match=r"cannot set the coordinates .* independently"):
+            build(move_base(robot, base))

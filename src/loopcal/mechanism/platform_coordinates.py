@@ -70,6 +70,7 @@ def pose_from_coordinates(
 ) -> FloatArray:
     """Return poses (.., 4, 4) with coordinates values (.., c); all others are those of `base`."""
     T = np.array(np.broadcast_to(base, (*values.shape[:-1], 4, 4)))
+    values, names = _add_turns(values, names, base)
     given = {name: values[..., i] for i, name in enumerate(names)}
     for i, name in enumerate(POSITION):
         if name in given:
@@ -86,10 +87,23 @@ def pose_from_coordinates(
 
 def state_target(values: FloatArray, names: tuple[str, ...], base: FloatArray) -> Target:
     """Return the poses of `pose_from_coordinates` (t | 1, n, c) as the engine states them."""
+    values, names = _add_turns(values, names, base)
     turns = ("phi", "theta", "psi") if set(names) & set(TILT) else ("yaw", "pitch", "roll")
     places = {name: i for i, name in enumerate(names)}
     columns = tuple(places.get(name, -1) for name in (*POSITION, *turns))
     return Target(values, columns, turns[0] == "phi", base)
+
+
+def _add_turns(
+    values: FloatArray, names: tuple[str, ...], base: FloatArray
+) -> tuple[FloatArray, tuple[str, ...]]:
+    """Return coordinates with those angles of `base` that other angles do not give."""
+    for turns in (TILT, EULER):
+        missing = tuple(name for name in turns if name not in names)
+        if 0 < len(missing) < len(turns) and (own := read_coordinates(base, missing)).any():
+            own = np.broadcast_to(own, (*values.shape[:-1], len(missing)))
+            return np.concatenate([values, own], axis=-1), (*names, *missing)
+    return values, names
 
 
 def compare_coordinates(
@@ -149,5 +163,6 @@ def _torsion(rotation: FloatArray) -> tuple[FloatArray, FloatArray]:
     # d psi = (ez + n) . omega / (1 + cos theta): orthogonal to the axes that phi and theta turn
     # about
     normal = rotation[:, :, 2]
-    row = (normal + np.array([0.0, 0.0, 1.0])) / (1.0 + normal[:, 2:])
+    left = 1.0 + normal[:, 2:]  # zero upside down, where torsion has no meaning, and no slope
+    row = (normal + np.eye(3)[2]) * np.divide(1.0, left, out=np.zeros_like(left), where=left > 0)
     return geometry.matrix_to_tilt_torsion(rotation)[..., 2], row
