@@ -80,7 +80,7 @@ def test_a_table_that_is_too_small_says_so() -> None:
     assert not found.data["is_met"]
     assert found.data["after"].value > 1e-3
     assert found.data["others"] == ("x", "y")
-    assert found.data["rest"].value > 0.1
+    assert float(found.data["rests"][0].removesuffix(" mm")) > 0.1
 
 
 def test_periodic_errors_of_screws_are_corrected_by_tables_of_readings(tmp_path) -> None:
@@ -125,3 +125,21 @@ def test_a_corner_out_of_reach_is_named_with_its_place(tmp_path) -> None:
         make_tables(disturb(robot), robot, GRID)
     assert refused.value.finding is not None
     assert refused.value.finding.data["reason"] == "reach"
+
+
+@pytest.mark.parametrize("name", ["hexapod-42", "tricept", "cable-4", "core-xy"])
+def test_a_skew_leaves_after_the_best_motion_what_it_states(name) -> None:
+    robot = lc.load_robot(name)
+    (table,), found = make_tables(disturb(robot), robot, TableSize("skew", 0, 0))
+    assert set(table.values) == {"xy", "xz", "yz", "x", "y", "z"}
+    if not robot.controlled[3:]:  # others are no machines with straight axes
+        assert found.data["after"].value < 0.5 * found.data["before"].value
+    assert found.data["others"] == robot.controlled[3:]
+    assert bool(found.data["rests"]) == bool(robot.controlled[3:])
+
+
+def test_angles_that_a_height_map_leaves_are_stated() -> None:
+    robot = lc.load_robot("hexapod-42")
+    found = make_tables(disturb(robot), robot, HEIGHT)[1]
+    assert found.data["others"] == ("x", "y", "roll", "pitch", "yaw")
+    assert [text.split()[1] for text in found.data["rests"]] == ["mm", "deg"]

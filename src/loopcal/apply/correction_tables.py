@@ -124,7 +124,7 @@ def make_tables(
     if reason:
         raise DataError(_refuse(robot, reason))
     ranges = workspace_ranges(robot)
-    moved = ["z"] if size.what == "height" else names
+    moved = {"height": ["z"], "skew": ["x", "y", "z"]}.get(size.what, list(names))
     machine = _Machine(robot, controller, [names.index(name) for name in moved])
     axes, home = list(names), read_coordinates(robot.home, names)
     if size.what == "height":
@@ -179,7 +179,10 @@ def _report(
         data[key] = robot.to_quantity(position, Dimension.LENGTH)
         data[f"angle_{key}"] = robot.to_quantity(angle, Dimension.ANGLE) if angle else 0
     data["others"] = tuple(robot.controlled[i] for i in others)
-    data["rest"] = robot.to_quantity(machine.measure(misses[1], others)[0], Dimension.LENGTH)
+    rests = zip(
+        machine.measure(misses[1], others), (Dimension.LENGTH, Dimension.ANGLE), strict=True
+    )
+    data["rests"] = [str(robot.to_quantity(rest, dimension)) for rest, dimension in rests if rest]
     level = Severity.INFO if is_met and not others else Severity.WARNING
     return report_finding("files.table-remains", level, **data)
 
@@ -253,18 +256,22 @@ def _fit_skew(
     machine: _Machine, targets: FloatArray, before: FloatArray
 ) -> tuple[list[CorrectionTable], FloatArray, FloatArray]:
     """Return skews and scales, errors at targets (n, c), and what remains of them."""
-    A = np.linalg.lstsq(*(x - x.mean(axis=0) for x in (targets, targets + before)), rcond=None)[0].T
+    places, led = targets[:, :3], (targets + before)[:, :3]
+    A = np.linalg.lstsq(*(x - x.mean(axis=0) for x in (places, led)), rcond=None)[0].T
     T = np.linalg.qr(A)[1]
     T *= np.sign(np.diag(T))[:, None]
     scale, U = np.diag(T).copy(), T / np.diag(T)
     if any(actuator.weights for actuator in machine.controller.actuators):
         scale[:2] = scale[:2].mean()  # both belts drive x and y
-    after = machine.lead(targets, np.linalg.solve(U, targets.T).T / scale)
+    commands = np.column_stack([np.linalg.solve(U, places.T).T / scale, targets[:, 3:]])
+    after = machine.lead(targets, commands)
     usable = np.isfinite(after).all(axis=1)
     aligned = []
     for misses in (before[usable], after[usable]):
-        M = align_point_sets(targets[usable] + misses, targets[usable])
-        aligned.append((targets[usable] + misses) @ M[:3, :3].T + M[:3, 3] - targets[usable])
+        led = places[usable] + misses[:, :3]
+        M = align_point_sets(led, places[usable])
+        left = led @ M[:3, :3].T + M[:3, 3] - places[usable]
+        aligned.append(np.column_stack([left, misses[:, 3:]]))
     values = {"xy": U[0, 1], "xz": U[0, 2], "yz": U[1, 2], **dict(zip("xyz", scale, strict=True))}
     return [CorrectionTable({}, values)], *aligned
 

@@ -319,7 +319,7 @@ def get_step_distance(cfg: KlipperConfig, section: str, is_rotary: bool = False)
     rotation = math.tau if is_rotary else cfg.positive(section, "rotation_distance")
     steps = cfg.positive(section, "microsteps")
     steps *= cfg.positive(section, "full_steps_per_rotation", 200.0)
-    if not cfg.has(section, "gear_ratio"):
+    if not is_rotary and not cfg.has(section, "gear_ratio"):
         return rotation / steps
     text, ratio = cfg.text(section, "gear_ratio"), 1.0
     for pair in text.split(","):

@@ -254,6 +254,16 @@ def test_heights_of_a_rotary_delta_lead_to_its_geometry(klipper, tmp_path) -> No
     np.testing.assert_allclose(fit.values, truth.values, rtol=0, atol=2e-6)  # [m, rad]; 0.001 steps
 
 
+def test_a_motor_without_gear_is_refused_as_by_klipper(tmp_path) -> None:
+    path = tmp_path / "printer.cfg"
+    probed = "#*# [delta_calibrate]\n#*# height0 = 0.1\n#*# height0_pos = 3000,3000,3000\n"
+    path.write_text(
+        ROTARY.replace("[stepper_b]\ngear_ratio: 107.000:16, 60:16", "[stepper_b]") + probed
+    )
+    with pytest.raises(FileError, match=r"'gear_ratio' of \[stepper_b"):
+        read(path)
+
+
 def test_arms_that_do_not_reach_are_refused_with_their_line(tmp_path) -> None:
     path = tmp_path / "printer.cfg"
     path.write_text(ROTARY.replace("shoulder_height: 412.9", "shoulder_height: 912.9"))
