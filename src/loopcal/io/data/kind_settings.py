@@ -58,11 +58,10 @@ from loopcal.units import (
     SI_SYMBOLS,
     SMALLEST_SD,
     UNITS,
-    Angle,
     Dimension,
     Expansion,
+    Given,
     Length,
-    Pixel,
     Ratio,
     Temperature,
     Unit,
@@ -153,6 +152,7 @@ StatedSd = tuple[float, "StatedSize"]  # standard deviation [SI], and how it is 
 LENGTHS = Annotated[list[Any], Dimension.LENGTH]
 NUMBERS = Annotated[list[Any], Dimension.RATIO]
 NAMES = tuple[str, ...] | str
+Scope = Literal["session", "all"]
 
 
 def read_kind(file: YamlFile, node: Mapping[str, Any], location: Location) -> Kind:
@@ -357,21 +357,19 @@ EXAMPLE = (
 )
 
 
-_NUMBERS: tuple[Any, ...] = (Length, Angle, Ratio, Pixel)
+@dataclass(frozen=True)
+class KnownParameter:
+    """The knowledge of a parameter, whose dimension its class states."""
+
+    start: Given | None = None
+    sd: Given | None = None
+    fixed: bool = False
+    scope: Scope = "session"
+
+
 RECORDS = {
-    dimension: make_dataclass(
-        "KnownParameter",
-        [
-            ("start", number | None, None),
-            ("sd", number | None, None),
-            ("fixed", bool, False),
-            ("scope", Literal["session", "all"], "session"),
-        ],
-        frozen=True,
-    )
-    for dimension, number in zip(
-        (Dimension.LENGTH, Dimension.ANGLE, Dimension.RATIO, Dimension.PIXEL), _NUMBERS, strict=True
-    )
+    dimension: type("KnownParameter", (KnownParameter,), {"GIVEN": dimension})
+    for dimension in (Dimension.LENGTH, Dimension.ANGLE, Dimension.RATIO, Dimension.PIXEL)
 }
 """Dimension -> record of the knowledge of a parameter."""
 
@@ -573,9 +571,6 @@ SHARED_ERRORS: Mapping[str, str] = {
     MPE: "maximum permissible error of the certificate, `constant` and `per_length`, in place of "
     "the noise of lengths and of the scale, with `scope` as of `scale`",
 }
-
-
-Scope = Literal["session", "all"]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -26,6 +26,7 @@ from pathlib import Path
 from typing import NoReturn
 
 import numpy as np
+import regex
 
 from loopcal import geometry
 from loopcal.errors import FileError, suggest_names
@@ -52,7 +53,7 @@ from loopcal.io.core.limits import (
 )
 from loopcal.io.core.text_file import as_path, read_bytes, read_text, write_text
 from loopcal.io.core.yaml_file import format_flow
-from loopcal.io.data.columns import COVARIANCE, LINK, NOTE, SIGMA, TIME, USE_COLUMN
+from loopcal.io.data.columns import COVARIANCE, LINK, MEASURED, NOTE, SIGMA, TIME, USE_COLUMN
 from loopcal.io.data.kind_settings import KindRows, read_kinds
 from loopcal.io.data.measurement_file import FORMAT, join_tables, read_tables
 from loopcal.io.exports.profile import (
@@ -99,6 +100,7 @@ def read_lines(
     and those that the profile skips. FileError : unreadable, empty, or without the header.
     """
     record = profile.record
+    ignored = None if record.ignore is None else regex.compile(record.ignore)
     by_target = profile.columns_by_target.values()
     sources = [p for columns in by_target for source in columns.values() for p in source.places]
     named = {place for place in (*sources, *record.matrix) if isinstance(place, str)}
@@ -109,7 +111,6 @@ def read_lines(
     for number, line in enumerate(text.split("\n"), 1):
         LINE_LENGTH.check(len(line), "export", path, number)
         is_comment = record.comment is not None and line.lstrip().startswith(record.comment)
-        ignored = profile.ignored
         is_ignored = ignored is not None and clock.match(ignored.search, line, ("ignore",))
         if number <= record.skip or not line.strip() or is_comment or is_ignored:
             skipped += bool(line.strip())
@@ -287,7 +288,8 @@ def list_headers(profile: Profile) -> dict[str, str | None]:
     units |= {name: "1" for name in ("qw", "qx", "qy", "qz") if profile.record.matrix}
     first: dict[str, str | None] = {"pose": None}
     if len(profile.targets) < 2:
-        measured = [profile.name_measured(name) for name in profile.measured]
+        stated = ((name, MEASURED + name) for name in profile.measured)
+        measured = [own if own in profile.columns else name for name, own in stated]
         others = {n: u for n, u in units.items() if n not in measured}
         return first | others | {n: units[n] for n in measured}
     shared = {n: u for n, u in units.items() if not _belongs_to_target(n, profile)}

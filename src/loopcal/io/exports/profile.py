@@ -237,11 +237,6 @@ class Profile:
         return "utf-8-sig" if name == "utf-8" else name
 
     @cached_property
-    def ignored(self) -> Pattern | None:
-        """The compiled `ignore`."""
-        return None if self.record.ignore is None else regex.compile(self.record.ignore)
-
-    @cached_property
     def columns(self) -> Mapping[str, ColumnSource]:
         """Sources of all columns, readings included."""
         return {**self.record.columns, **self.record.readings}
@@ -293,10 +288,6 @@ class Profile:
     def parse(self, text: str) -> float | None:
         """Return the finite number of a cell; None for other text."""
         return parse_finite(self.with_point(text))
-
-    def name_measured(self, name: str) -> str:
-        """Return the profile's name of a measured column: `measured.NAME` where it is stated so."""
-        return MEASURED + name if MEASURED + name in self.columns else name
 
 
 FORMAT = 1
