@@ -111,7 +111,7 @@ def test_target_outside_the_limits_gives_exit_code_2_and_no_reading(
         (TARGETS.replace("yaw", "jaw"), "targets.csv:1: no column 'yaw' (did you mean 'jaw'?)"),
         (TARGETS.replace("x [mm]", "X [mm],x [mm]"), "has 8 columns"),
         (TARGETS.replace("0.21e3", ""), "targets.csv:3: column 'z' is empty"),
-        (TARGETS.replace("left", "home"), "targets.csv:3: duplicate target"),
+        (TARGETS.replace("left", "home"), "targets.csv:3: pose 'home' is also row 1"),
         ("pose\n", "has a header but no rows"),
     ],
 )

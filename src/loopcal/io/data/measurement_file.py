@@ -620,27 +620,28 @@ def list_measurement_files(path: Paths) -> dict[str, Path]:
     return files
 
 
-def load_poses(path: str | Path, robot: Mechanism) -> FloatArray:
+def load_poses(path: str | Path | Table, robot: Mechanism) -> FloatArray:
     """Read commanded poses (n, c) [m, rad]: one column for each controlled coordinate."""
-    table = read_table(path)
+    table = path if isinstance(path, Table) else read_table(path)
     require_columns(table, robot.controlled, f"a coordinate of {robot.name}")
     return np.column_stack(
         [table.numbers(name, get_dimension(name), empty=False) for name in robot.controlled]
     )
 
 
-def load_pose_names(path: str | Path) -> tuple[tuple[str, ...], Sequence[str]]:
+def load_pose_names(path: str | Path | Table) -> tuple[tuple[str, ...], Sequence[str]]:
     """Read the names of commanded poses (n,), "1", "2", ... without a column `pose`, and their
-    places such as `poses.csv:12`; FileError where a name occurs twice.
+    places such as `poses.csv:12`; FileError where a name is missing, or occurs twice.
     """
-    table = read_table(path)
+    table = path if isinstance(path, Table) else read_table(path)
     names = table.pose_names()
     first: dict[str, int] = {}
     for i, name in enumerate(names):
-        if first.setdefault(name, i) != i:
-            row = first[name] + 1
-            sentence = f"pose {name!r} is also row {row}. Give each pose a separate name"
-            raise table.row_error(i, sentence)
+        if first.setdefault(name, i) != i or not name:
+            fact = (
+                f"pose {name!r} is also row {first[name] + 1}" if name else "this pose has no name"
+            )
+            raise table.row_error(i, f"{fact}. Give each pose a separate name")
     return names, table.places(np.arange(len(names)))
 
 

@@ -230,21 +230,15 @@ def parse(path: Path) -> Samples:
         if len(anchors) != lines:
             sentence = f"{ANCHORS!r} has {len(anchors)} rows, but there are {lines} lines"
             raise FileError(f"{sentence}. Write one row for each", path)
-    gear, taped = float(motor_teeth / spool_teeth), _parse_taped(content, path, lines)
-    spools, findings = (radius, advantage, per_spool, gear), tuple(_report_ignored(content))
-    return Samples(*spools, motors * DEG, known, anchors, taped, findings)
-
-
-def _parse_taped(content: dict[str, Any], path: Path, lines: int) -> FloatArray:
-    """Return the taped lengths (n,), NaN for lines whose length is null or 0."""
-    stated = content.get(TAPED)
-    if stated is None:
-        return np.full(lines, np.nan)
-    cells = stated if isinstance(stated, list) else []
+    stated = content.get(TAPED)  # null or 0 for lines that were not taped
+    cells = [None] * lines if stated is None else stated if isinstance(stated, list) else []
     if len(cells) != lines or not all(v is None or (_is_number(v) and v >= 0.0) for v in cells):
         finding = report_finding("files.taped-lengths", key=TAPED, value=str(stated), lines=lines)
         raise FileError(finding, path)
-    return np.array([v or np.nan for v in cells], dtype=float)
+    taped = np.array([v or np.nan for v in cells], dtype=float)
+    gear = float(motor_teeth / spool_teeth)
+    spools, findings = (radius, advantage, per_spool, gear), tuple(_report_ignored(content))
+    return Samples(*spools, motors * DEG, known, anchors, taped, findings)
 
 
 def estimate_anchors(samples: Samples, path: Path) -> FloatArray:

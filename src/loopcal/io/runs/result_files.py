@@ -14,8 +14,6 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from loopcal.errors import suggest_names
 from loopcal.io.core.csv_table import (
     format_columns,
@@ -23,10 +21,10 @@ from loopcal.io.core.csv_table import (
     format_row,
     format_scaled,
     read_table,
-    require_columns,
 )
 from loopcal.io.core.outputs import FolderKind
 from loopcal.io.data.columns import COMMANDED, NOTE
+from loopcal.io.data.measurement_file import load_pose_names, load_poses
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import get_dimension
 from loopcal.plain_text import escape_formula
@@ -53,22 +51,13 @@ def load_targets(path: str | Path, robot: Mechanism) -> tuple[FloatArray, tuple[
     FileError : a value that does not fit, at its line.
     """
     table = read_table(path)
-    known = ("pose", *robot.controlled)
-    require_columns(table, robot.controlled, f"a commanded coordinate of {robot.name}")
+    coordinates, known = load_poses(table, robot), ("pose", *robot.controlled)
     for name in table.names:
         if name not in known and not name.startswith(NOTE):
             sentence = f"column {name!r} is unknown{suggest_names(name, known)}"
             act = f"allowed: {', '.join(known)}. Call it '{NOTE} {name}' to ignore it"
             raise table.header_error(f"{sentence}; {act}")
-    columns = [table.numbers(name, get_dimension(name), empty=False) for name in robot.controlled]
-    labels = table.pose_names()
-    used: set[str] = set()
-    for i, label in enumerate(labels):
-        if not label or label in used:
-            problem = f"duplicate target {label!r}" if label else "this target has no name"
-            raise table.row_error(i, f"{problem}. Give each target a separate name")
-        used.add(label)
-    return np.column_stack(columns), labels
+    return coordinates, load_pose_names(table)[0]
 
 
 def format_compensation(result: Compensation) -> str:

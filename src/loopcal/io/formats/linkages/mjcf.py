@@ -186,9 +186,7 @@ class _Reader:
             name = stated.get("name") or f"joint {i + 1} of {body}"
             texts = stated.get("pos", "0 0 0"), stated.get("axis", "0 0 1")
             center = joint.parse_numbers(texts[0], 3, f"pos of joint {name!r}")
-            axis = joint.parse_numbers(texts[1], 3, f"axis of joint {name!r}")
-            if not np.linalg.norm(axis) > 0:
-                raise joint.error(f"joint {name!r} has the axis 0 0 0. Write a direction")
+            axis = joint.parse_direction(texts[1], f"joint {name!r}")
             place = geometry.make_pose(np.eye(3), center)
             link = f"{body} at {name}"
             where = element.attributes
@@ -202,7 +200,7 @@ class _Reader:
                     carrier,
                     link,
                     origin @ place,
-                    axis / np.linalg.norm(axis),
+                    axis,
                     self._read_limits(joint, stated, KINDS[kind]),
                     joint.line,
                     joint,
@@ -222,7 +220,7 @@ class _Reader:
         self, joint: Element, stated: Mapping[str, str], kind: str
     ) -> tuple[float, float] | None:
         """Return the range of a joint from its drawn pose [rad, m], None without."""
-        reference = float(joint.parse_numbers(stated.get("ref", "0"), 1, "ref")[0])
+        reference = joint.parse_number(stated.get("ref", "0"), "ref")
         turns = kind == "R"
         if reference and kind != "S":
             value = self.parse_angle(reference) if turns else reference

@@ -162,17 +162,14 @@ def _read_joint(
         if axis is None:
             continue
         texts.append(axis.get("xyz") or "0 0 1")
-        vector = element.parse_numbers(texts[-1], 3, f"the axis of joint {name!r}")
-        if not np.linalg.norm(vector) > 0:
-            raise element.error(f"joint {name!r} has the axis 0 0 0. Write a direction")
+        axes[i] = element.parse_direction(texts[-1], f"joint {name!r}")
         xyz = axis.find("xyz")
         frame = "" if xyz is None else xyz.attributes.get("expressed_in", "")
         if frame or in_model or axis.get("use_parent_model_frame") in ("1", "true"):
-            vector = R_joint.T @ frames.place(frame or MODEL)[:3, :3] @ vector
-        axes[i] = vector / np.linalg.norm(vector)
+            axes[i] = R_joint.T @ frames.place(frame or MODEL)[:3, :3] @ axes[i]
         low, high = (axis.find("limit", key) for key in ("lower", "upper"))
         if i == 0 and stated != "continuous" and low is not None and high is not None:
-            low, high = (float(e.parse_numbers(e.text, 1, "limit")[0]) for e in (low, high))
+            low, high = (e.parse_number(e.text, "limit") for e in (low, high))
             limits = (low, high) if -UNLIMITED < low < high < UNLIMITED else None
     pose = element.get("pose").split() or ["0"] * 6
     rounding = measure_rounding(pose[:3], [*pose[3:], *texts])
@@ -288,14 +285,14 @@ def _read_gearbox(
     if driver is None or driven is None:
         raise gear.element.error(f"gearbox {gear.name!r} joins links that no joint carries")
     element = gear.element.find("gearbox_ratio")
-    ratio = 1.0 if element is None else float(element.parse_numbers(element.text, 1, "ratio")[0])
+    ratio = 1.0 if element is None else element.parse_number(element.text, "ratio")
     return driven.name, (driver.name, -ratio, 0.0)
 
 
 def _read_mimic(mimic: Element) -> tuple[str, float, float]:
     """Return the joint that is followed, factor and offset."""
     factor, offset, reference = (
-        float(mimic.parse_numbers(mimic.get(key) or default, 1, key)[0])
+        mimic.parse_number(mimic.get(key) or default, key)
         for key, default in (("multiplier", "1"), ("offset", "0"), ("reference", "0"))
     )
     return mimic.attributes.get("joint", ""), factor, offset - factor * reference

@@ -84,6 +84,17 @@ class Element:
             raise self.error(f"{what} is {text!r}, but {words} needed. Correct it")
         return np.array([parse_number(number, what, self.path, self.line) for number in numbers])
 
+    def parse_number(self, text: str, what: str) -> float:
+        """Return the only number of a text of this element."""
+        return float(self.parse_numbers(text, 1, what)[0])
+
+    def parse_direction(self, text: str, what: str) -> FloatArray:
+        """Return the axis that a text of this element states as unit vector (3,)."""
+        vector = self.parse_numbers(text, 3, f"the axis of {what}")
+        if not (length := float(np.linalg.norm(vector))) > 0:
+            raise self.error(f"{what} has the axis 0 0 0. Write a direction")
+        return vector / length
+
     def replace_attribute(self, raw: bytes, name: str, values: FloatArray) -> Edit | None:
         """Return the edit of an attribute with other numbers; None where it has no such one."""
         tag = raw[self.start : self.end].decode()

@@ -126,15 +126,14 @@ def _build_joint(element: Element) -> TreeJoint:
     limits = None
     if kind and stated != "continuous" and {"lower", "upper"} <= limit.keys():
         low, high = (
-            float(element.parse_numbers(limit[key], 1, f"{key} of {what}")[0])
-            for key in ("lower", "upper")
+            element.parse_number(limit[key], f"{key} of {what}") for key in ("lower", "upper")
         )
         limits = (low, high) if low < high else None
     mimic = _get_attributes(element, "mimic")
     followed = None
     if mimic:
         factor, offset = (
-            float(element.parse_numbers(mimic.get(key, default), 1, f"{key} of {what}")[0])
+            element.parse_number(mimic.get(key, default), f"{key} of {what}")
             for key, default in (("multiplier", "1"), ("offset", "0"))
         )
         followed = mimic.get("joint", ""), factor, offset
@@ -233,12 +232,7 @@ def _parse_origin(element: Element, origin: Mapping[str, str], what: str) -> Flo
 
 def _parse_axis(element: Element, name: str, what: str) -> FloatArray:
     """Return an axis as unit vector (3,)."""
-    text = _get_attributes(element, name).get("xyz", "1 0 0")
-    vector = element.parse_numbers(text, 3, f"the axis of {what}")
-    length = float(np.linalg.norm(vector))
-    if not length > 0:
-        raise element.error(f"{what} has the axis 0 0 0. Write a direction")
-    return vector / length
+    return element.parse_direction(_get_attributes(element, name).get("xyz", "1 0 0"), what)
 
 
 def rewrite(before: LinkTree, after: LinkTree) -> str:
