@@ -434,8 +434,8 @@ def export(
 ) -> Output:
     """Write the parameters of RUN, or of a robot file, as another program reads them.
 
-    The formats grid, grid-klipper, grid-reprap and grid-linuxcnc are tables of corrections for a
-    controller that keeps its geometry. A note states the error that remains between nodes.
+    The formats klipper-skew, grid and grid-.. are corrections for a controller that keeps its
+    geometry: a skew, or tables. A note states the error that remains, between the nodes of a table.
 
     Without -o, the command prints lines to type: each identified value with three digits of its
     uncertainty, at most the decimals that the controller keeps. Files have all digits. A note

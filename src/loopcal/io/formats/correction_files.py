@@ -118,7 +118,7 @@ def write_compensation(source: ExportSource, into: Path | None) -> Exported:
         files[file] = "".join(
             " ".join(map(format_number, (0.0 + row).tolist())) + "\n" for row in rows
         )
-        lines += [f"[JOINT_{joint}]  # {name}", f"COMP_FILE = {file}"]
+        lines += [f"# {name}", f"[JOINT_{joint}]", f"COMP_FILE = {file}"]
         lines += ["COMP_FILE_TYPE = 1"]
     notes = note_lost_terms(robot, COMPENSATION.name)
     if source.is_for_people:
