@@ -24,6 +24,7 @@ import numpy as np
 from loopcal.diagnose.conventions.misfit import (
     ALLOWED,
     BETTER,
+    MOST_EXCLUDED,
     Comparison,
     compare_with_robot,
     compute_fitted_misfit,
@@ -327,6 +328,8 @@ def _compare_interpretations(
         if misfit > ALLOWED:
             stated = exclude_far_rows(whole)
             misfit = min(misfit, refine_misfit(stated)[0])
+        if misfit > IMPLAUSIBLE and stated is not None and not stated.excluded:
+            stated, misfit = _leave_out_pose(free, stated, misfit)
         if not misfit > ALLOWED:
             if stated is None or not stated.excluded or not whole.misfit > IMPLAUSIBLE:
                 return ConventionCheck(misfit, finding=report_equals(free, reached, misfit))
@@ -390,6 +393,29 @@ def _compare_interpretations(
         alternatives=tuple(other.describe() for other in listed),
     )
     return ConventionCheck(misfit, finding=finding)
+
+
+def _leave_out_pose(
+    free: FreeParameters, stated: Comparison, misfit: float
+) -> tuple[Comparison, float]:
+    """Compare without one of the poses of the largest residuals, and return the comparison without
+    the one that alone explains the misfit; else the given ones. Of few poses, an unknown frame
+    follows a wrong one, so that no row is far off the others.
+    """
+    data, size = stated.data, np.zeros(stated.data.n_poses)
+    for rows, residual in zip(data.observations, stated.residuals(), strict=False):
+        square = np.nan_to_num(residual.whitened[0]) ** 2
+        np.add.at(size, rows.rows.reshape(len(rows), -1)[:, 0], square.sum(axis=1))
+    poses, tried = np.arange(data.n_poses), np.argsort(-size, kind="stable")[:MOST_SINGLE]
+    if MOST_EXCLUDED * np.count_nonzero(size) < 1.0:
+        return stated, misfit
+    for wrong in tried.tolist():
+        left = compare_with_robot(free, data.take(poses != wrong))
+        linear = left.linearization
+        has_enough = linear is not None and int(linear.equations[0]) >= FEWEST_TO_REFUSE
+        if has_enough and (alone := refine_misfit(left)[0]) <= ALLOWED:
+            return replace(stated, excluded=(data.labels[wrong],)), alone
+    return stated, misfit
 
 
 def _contradict(misfit: float, against: Contradiction) -> ConventionCheck:
