@@ -89,7 +89,7 @@ FINDS = {
             "e.txt": (EXPORTS / "six-dof.txt").read_text("utf-8"),
             "p.yaml": (EXPORTS / "six-dof.yaml").read_text("utf-8").replace("%S'", "%S %Y'"),
         },
-        "p.yaml:14: '%Y-%m-%d %H:%M:%S %Y' is not a format of times",
+        "format' is '%Y-%m-%d %H:%M:%S %Y', which is not a format of times",
     ),
     "target whose name no column can have": (
         "import e.txt --profile p.yaml -o new.csv",

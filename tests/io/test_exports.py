@@ -202,7 +202,7 @@ def test_export_that_does_not_fit_the_profile_is_refused_with_the_reason(tmp_pat
 BAD_PROFILES = {
     "no delimiter": ("delimiter: semicolon\n", "", None, "no key 'delimiter'"),
     "an unknown delimiter": ("semicolon", "pipe", 2, "'delimiter' is 'pipe'. Allowed: 'comma'"),
-    "a comma for two things": ("semicolon", "comma", 3, "both the decimal mark and the separator"),
+    "a comma for two things": ("semicolon", "comma", 3, "'decimal' is the comma, as the separator"),
     "an unknown key": ("decimal", "decimals", 3, "unknown key 'decimals'.*did you mean 'decimal'"),
     "an unknown column": ("  z:", "  zz:", 8, "'zz' is not a column of .* the kind 'position'"),
     "a missing column": ("  z: {from: Z, unit: mm}\n", "", 4, "gives 0 sources of 'z'"),
@@ -214,7 +214,12 @@ BAD_PROFILES = {
         "'z': unknown unit 'mmm' .did you mean 'mm'",
     ),
     "a unit of text": ("Name", "Name, unit: mm", 5, "'pose' is text and has no unit"),
-    "an invalid column number": ("from: Z", "from: 0", 8, "0 is neither a name in .* nor a place"),
+    "an invalid column number": (
+        "from: Z",
+        "from: 0",
+        8,
+        "is 0, which is neither a name in .* nor a place",
+    ),
     "no source": ("{from: Z, unit: mm}", "Z", 8, "'columns.z' is the text 'Z'"),
     "an invalid pattern": ("Name", "Name, match: '('", 5, "is not a regular expression"),
     "a pattern without a pose": ("Name", "Name, match: 'P.'", 5, "this pattern finds no pose"),
@@ -241,12 +246,12 @@ BAD_PROFILES = {
     "no readings": ("settings", "readings:\nsettings", 9, "'readings' is empty"),
     "an empty value": ("delimiter", "missing: [null]\ndelimiter", 2, "'missing entry 1' is empty"),
 } | {
-    name: ("decimal", f"encoding: {name}\ndecimal", 3, f"'{name}' is not a known encoding")
+    name: ("decimal", f"encoding: {name}\ndecimal", 3, f"'{name}', which is not a known encoding")
     for name in ("utf-99", "hex", "rot13")
 }
 BAD_UNCERTAINTIES = {
-    "factor 0": ("factor: 0.5, floor", "factor: 0, floor", 9, "'factor' is 0. Write a positive"),
-    "floor 0": ("floor: 0.002 mm", "floor: 0 mm", 9, "'floor' is 0 mm. Write a positive quantity"),
+    "factor 0": ("factor: 0.5, floor", "factor: 0, floor", 9, "factor' is 0. Write a positive"),
+    "floor 0": ("floor: 0.002 mm", "floor: 0 mm", 9, "floor' is 0 mm. Write a positive quantity"),
     "floor in degrees": ("floor: 0.002 mm", "floor: 2 deg", 9, "deg"),
     "floor without unit": ("floor: 0.002 mm", "floor: 2", 9, "unit"),
     "factor of x": ('mm]", unit: mm', 'mm]", unit: mm, factor: 2', 6, "'factor' belongs to"),

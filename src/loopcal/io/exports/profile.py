@@ -40,7 +40,7 @@ from loopcal.io.data.columns import (
 from loopcal.io.data.kind_settings import POSE_SETTINGS, SETTINGS, list_kind_settings, read_kind
 from loopcal.io.robot.robot_file import check_format
 from loopcal.plain_text import quote
-from loopcal.units import Dimension, find_unit, list_symbols, parse_quantity
+from loopcal.units import UNITS, Dimension, find_unit, list_symbols, parse_quantity
 
 if TYPE_CHECKING:
     from loopcal.measure.kinds.kind import Kind
@@ -109,6 +109,8 @@ def refuse_pattern(file: YamlFile, text: str, location: Location) -> None:
 DELIMITERS: Mapping[str, str | None] = {"comma": ",", "semicolon": ";", "tab": "\t", "spaces": None}
 DECIMALS: Mapping[str, str] = {"point": ".", "comma": ","}
 Place = int | str
+SOME_TIME = datetime(2026, 5, 4, 10, 22, 31, tzinfo=UTC)
+"""A time that a format must write and read."""
 
 
 def normalize_name(text: str) -> str:
@@ -121,6 +123,14 @@ def normalize_name(text: str) -> str:
 
 def _normalize_places(places: Iterable[Place]) -> tuple[Place, ...]:
     return tuple(normalize_name(p) if isinstance(p, str) else p for p in places)
+
+
+def _check_places(key: str, places: Sequence[Place]) -> None:
+    """Raise ValueError for places, of a key, that are neither names nor numbers from 1."""
+    for place in places or ("",):
+        if place == "" or (isinstance(place, int) and place < 1):
+            sentence = f"{key} is {place!r}, which is neither a name in the export's header nor a"
+            raise ValueError(f"{sentence} place from 1. Correct it")
 
 
 TARGET = "{target}"
@@ -149,6 +159,27 @@ class ColumnSource:
     floor: str | int | float | None = None
     match: str | None = None
     format: str | None = None
+
+    def __post_init__(self) -> None:
+        _check_places("from", self.places)
+        if not (self.factor > 0.0 and math.isfinite(self.factor)):
+            act = "Write a positive number, such as 0.5 for U(k=2)"
+            raise ValueError(f"factor is {self.factor:g}. {act}")
+        if self.symbol in UNITS:
+            try:
+                is_positive = self.floor is None or float(self.least) > 0.0
+            except UnitError as error:
+                raise ValueError(f"floor is wrong: {error}") from None
+            if not is_positive:
+                act = "Write a positive quantity, such as 1 um"
+                raise ValueError(f"floor is {self.floor}. {act}")
+        if self.format is not None:
+            try:
+                datetime.strptime(SOME_TIME.strftime(self.format), self.format)
+            except (ValueError, re.error):  # strptime makes a regular expression of it
+                act = "Write each of its parts once, such as '%d.%m.%Y %H:%M:%S'"
+                sentence = f"format is {quote(self.format)}, which is not a format of times"
+                raise ValueError(f"{sentence}. {act}") from None
 
     @property
     def places(self) -> tuple[Place, ...]:
@@ -215,6 +246,19 @@ class ProfileRecord:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "matrix", _normalize_places(self.matrix))
+        if self.matrix:
+            _check_places("matrix", self.matrix)
+        if DELIMITERS[self.delimiter] == DECIMALS[self.decimal]:
+            raise ValueError("decimal is the comma, as the separator. Correct one")
+        if self.skip < 0:
+            raise ValueError(f"skip is {self.skip}. Write a number of lines, 0 or more")
+        if self.comment == "":
+            raise ValueError("comment is empty. Write the start of a comment line")
+        try:
+            "".encode(codecs.lookup(self.encoding).name)  # refuses codecs not of text, such as hex
+        except (LookupError, ValueError):
+            sentence = f"encoding is {self.encoding!r}, which is not a known encoding"
+            raise ValueError(f"{sentence}. Write utf-8, utf-16, latin-1 or cp1252") from None
 
 
 @dataclass(frozen=True)
@@ -294,9 +338,6 @@ FORMAT = 1
 TEXTS = ("pose", *(column.name for column in POSE_COLUMNS), *ROW_COLUMNS)
 """Columns of text that an export may have."""
 
-SOME_TIME = datetime(2026, 5, 4, 10, 22, 31, tzinfo=UTC)
-"""A time that a format must write and read."""
-
 STATED = re.compile(r"[\[(]\s*(?P<unit>[^\[\]()]*?)\s*[\])]$")
 """The unit behind a name in a header, as in `X [mm]` or `X (mm)`."""
 
@@ -327,28 +368,13 @@ def read_profile(path: str | Path) -> Profile:
         refuse_unknown_keys(file, keys, POSE_SETTINGS, place)
         if "pose" not in record.columns:
             raise file.error(report_finding("files.readings-without-poses"), ("columns",))
-    if DELIMITERS[record.delimiter] == DECIMALS[record.decimal]:
-        sentence = "a comma cannot be both the decimal mark and the separator. Correct one"
-        raise file.error(sentence, ("decimal",))
-    if record.skip < 0:
-        raise file.error(f"'skip' is {record.skip}. Write a number of lines, 0 or more", ("skip",))
-    if record.comment == "":
-        raise file.error("'comment' is empty. Write the start of a comment line", ("comment",))
     if record.ignore is not None:
         refuse_pattern(file, record.ignore, ("ignore",))
-    try:
-        "".encode(codecs.lookup(record.encoding).name)  # refuses codecs not of text, such as hex
-    except (LookupError, ValueError):
-        sentence = f"{record.encoding!r} is not a known encoding"
-        act = "Write utf-8, utf-16, latin-1 or cp1252"
-        raise file.error(f"{sentence}. {act}", ("encoding",)) from None
     profile = Profile(file, record, kind)
     if "matrix" in file.content:
-        places = record.matrix
-        _check_places(file, places, ("matrix",))
         is_pose = kind is not None and kind.name == "pose"
         is_quaternion = is_pose and getattr(kind, "orientation", None) == "quaternion"
-        if len(places) != 9 or not is_quaternion:
+        if len(record.matrix) != 9 or not is_quaternion:
             sentence = "a matrix has nine columns, row by row, and needs 'kind: pose, orientation:"
             raise file.error(f"{sentence} quaternion'. Correct it", ("matrix",))
     check_columns(profile)
@@ -410,8 +436,7 @@ def _check_source(
     place: Location,
     dimensions: Mapping[str, tuple[Dimension, ...]],
 ) -> None:
-    """Raise FileError for a source without sense."""
-    _check_places(file, source.places, (*place, "from"))
+    """Raise FileError for a source that its column cannot have."""
     has_unit = source.unit is not None
     is_text = name in TEXTS or name.startswith(NOTE) or (name == TIME and not has_unit)
     if is_text and has_unit:
@@ -433,40 +458,19 @@ def _check_source(
             sentence = f"the export's header is {header!r}, but the unit here is {source.symbol!r}"
             act = f"Write the unit {stated}, or name the column by its place"
             raise file.error(f"{sentence}. {act}", unit_place)
-    _check_scale(file, name, source, place)
+    for key, is_stated in (("factor", source.factor != 1.0), ("floor", source.floor is not None)):
+        if is_stated and not name.startswith(SIGMA):
+            finding = report_finding("files.not-a-sigma", key=key, column=name)
+            raise file.error(finding, (*place, key))
     for key, value, owner in (("match", source.match, "pose"), ("format", source.format, TIME)):
         if value is not None and (name != owner or not is_text):
             sentence = f"{key!r} belongs to {owner!r}, not to {name!r}. Remove it"
             raise file.error(sentence, (*place, key))
-    if source.format is not None:
-        try:
-            datetime.strptime(SOME_TIME.strftime(source.format), source.format)
-        except (ValueError, re.error):  # strptime makes a regular expression of it
-            sentence = f"{quote(source.format)} is not a format of times"
-            act = "Write each of its parts once, such as '%d.%m.%Y %H:%M:%S'"
-            raise file.error(f"{sentence}. {act}", (*place, "format")) from None
     if source.match is not None:
         refuse_pattern(file, source.match, (*place, "match"))
         if source.pattern is None or "pose" not in source.pattern.groupindex:
             sentence = "this pattern finds no pose. Put its part of the name in (?P<pose>..)"
             raise file.error(sentence, (*place, "match"))
-
-
-def _check_scale(file: YamlFile, name: str, source: ColumnSource, place: Location) -> None:
-    """Raise FileError for a factor or a floor that is not positive, or not of a sigma."""
-    for key, is_stated in (("factor", source.factor != 1.0), ("floor", source.floor is not None)):
-        if is_stated and not name.startswith(SIGMA):
-            raise file.error(
-                report_finding("files.not-a-sigma", key=key, column=name), (*place, key)
-            )
-    if not (source.factor > 0.0 and math.isfinite(source.factor)):
-        sentence = f"'factor' is {source.factor:g}. Write a positive number, such as 0.5 for U(k=2)"
-        raise file.error(sentence, (*place, "factor"))
-    if source.floor is not None and source.symbol is not None:
-        dimension = find_unit(source.symbol).dimension
-        if not file.quantity(source.floor, dimension, (*place, "floor")) > 0.0:
-            sentence = f"'floor' is {source.floor}. Write a positive quantity, such as 1 um"
-            raise file.error(sentence, (*place, "floor"))
 
 
 def _check_unit(
@@ -485,17 +489,6 @@ def _check_unit(
             find_unit(factor, dimension)
         except UnitError as error:
             raise file.error(f"{name!r}: {error}", place) from None
-
-
-def _check_places(file: YamlFile, places: Sequence[Place], location: Location) -> None:
-    """Raise FileError for places that are neither names nor numbers from 1."""
-    for place in places:
-        if place == "" or (isinstance(place, int) and place < 1):
-            sentence = f"{place!r} is neither a name in the export's header nor a place from 1"
-            raise file.error(f"{sentence}. Correct it", location)
-    if not places:
-        sentence = "the column has no name. Write a name in the export's header or a place from 1"
-        raise file.error(sentence, location)
 
 
 # Profiles that come with loopcal, and what differs between two computers with the same
