@@ -162,20 +162,6 @@ ROUNDING = 1e-9
 """Excess, relative to the robot's size, of a target at the bound itself."""
 
 
-def measure_target_excess(robot: Mechanism, values: FloatArray, target: FloatArray) -> FloatArray:
-    """Return how far (R,) coordinates (R, c) lie beyond what links can span [m]; at most 0 within.
-
-    values : (1 | R, p). Coordinates of the position that are not controlled are free.
-    """
-    columns = [i for i, name in enumerate(robot.controlled) if name in POSITION]
-    if not columns:
-        return np.full(len(target), -np.inf)
-    center, radius = bound_platform(robot, values)
-    axes = [POSITION.index(robot.controlled[i]) for i in columns]
-    far = np.linalg.norm(target[:, columns] - center[:, axes], axis=1)
-    return far - radius - ROUNDING * robot.size
-
-
 def bound_platform(robot: Mechanism, values: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return center (t, 3) and radius (t,) of a sphere around all positions of the platform [m].
 
@@ -577,13 +563,19 @@ def _solve_within_reach(rows: _Rows, start: _Iterate, first: State, follow: bool
     """Return the last iterates of rows from their start, the state `first`; rows with a target
     beyond what the links span stay at the start.
     """
-    is_near = measure_target_excess(rows.robot, rows.values, rows.target) <= 0.0
+    robot, names = rows.robot, rows.robot.controlled
+    center, radius = bound_platform(robot, rows.values)
+    # coordinates of the position that are not controlled are free
+    columns = [i for i, name in enumerate(names) if name in POSITION]
+    axes = [POSITION.index(names[i]) for i in columns]
+    far = np.linalg.norm(rows.target[:, columns] - center[:, axes], axis=1)
+    is_near = far <= radius + ROUNDING * robot.size
     solved = replace(start, status=np.full_like(start.status, STALLED))
     near = np.flatnonzero(is_near)
     if not len(near):
         return solved
     own, begin = rows.select(near), start.take(near)
-    if not rows.robot.stages:
+    if not robot.stages:
         begin = _begin_near_targets(own, begin, map_arrays(lambda a: a[near], first))
     solved = solved.put(near, own.iterate(begin))
     wrong = near[solved.status[near] != CONVERGED]
