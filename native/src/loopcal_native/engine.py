@@ -78,7 +78,7 @@ def make_engine(variant: str = "") -> Engine:
     functions = own.solve, own.certify, own.reach, own.linearize, own.fold
     functions += own.differentiate, own.fold_poses, own.solve_triangles, own.compare_poses
     functions += own.follow, own.fold_compared
-    return Engine(f"native:{name}", VERSION, *functions, is_complete=True)
+    return Engine(f"native:{name}", VERSION, *functions)
 
 
 @dataclass(frozen=True)

@@ -66,9 +66,7 @@ class Engine:
 
     name : as in LOOPCAL_ENGINE, with its variant. version : of the package that computes.
     solve_triangles, compare_poses, follow, fold_compared : None where the functions of
-        `loopcal.numerics`, of `loopcal.geometry`, `solve` and `fold_poses` do it. is_complete :
-        whether programs may have nodes but the platform, and sums of driven joints may be given;
-        NumPy computes these for an engine that is not.
+        `loopcal.numerics`, of `loopcal.geometry`, `solve` and `fold_poses` do it.
     """
 
     name: str
@@ -84,7 +82,6 @@ class Engine:
     compare_poses: Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]] | None = None
     follow: Callable[..., State] | None = None
     fold_compared: Callable[..., tuple[State, FloatArray, BoolArray]] | None = None
-    is_complete: bool = False
 
     def __str__(self) -> str:
         return f"{self.name} {self.version}"
@@ -126,7 +123,7 @@ def _make_numpy_engine() -> Engine:
     from loopcal.engine.numpy_engine.targets import reach
 
     functions = solve, certify, reach, linearize, fold, differentiate, fold_poses
-    return Engine(NUMPY, np.__version__, *functions, is_complete=True)
+    return Engine(NUMPY, np.__version__, *functions)
 
 
 def _is_native_installed() -> bool:
@@ -156,12 +153,6 @@ def get_current_engine() -> Engine:
     return select_engine(os.environ.get(VARIABLE, ""))
 
 
-def _get_engine_for(program: Program, sums: Sums | None = None) -> Engine:
-    """Return the current engine, or NumPy for nodes and sums that it does not solve."""
-    current, is_plain = get_current_engine(), not program.others and sums is None
-    return current if current.is_complete or is_plain else _make_numpy_engine()
-
-
 def solve(
     program: Program,
     e: FloatArray,
@@ -188,11 +179,10 @@ def solve(
     Rows that fail are marked in `status`; nothing is raised. The closure sign is that of the limbs
     that constrain the platform: a limb whose joints only follow it may pass its own singularities.
     """
-    current = _get_engine_for(program, sums)
-    given: tuple[Sums, ...] = ()
+    current = get_current_engine()
     if sums is not None:
-        given, q = (sums,), program.list_drives(start.joints)
-    state = current.solve(program, e, q, start, task, free, max_iterations, goal, *given)
+        q = program.list_drives(start.joints)
+    state = current.solve(program, e, q, start, task, free, max_iterations, goal, sums)
     if not program.idle_groups:
         return state
     joints = tuple(state.joints[i] for i in program.idle_groups)
@@ -215,7 +205,7 @@ def follow(
     Arguments are those of `solve`, start : (t | 1, 1). With `ends`, a trial ends at its first pose
     that does not converge; the others get its status, and no meaning.
     """
-    own = _get_engine_for(program, sums).follow
+    own = get_current_engine().follow
     if own is None or program.idle_groups:
         from loopcal.engine.numpy_engine.newton import follow_by
 
@@ -231,7 +221,7 @@ def certify(program: Program, e: FloatArray, start: State, goal: State) -> NDArr
 
     e : (t | 1, n_displacements) [m, rad]. start : (t | 1, 1). goal : solutions (t, n).
     """
-    return _get_engine_for(program).certify(program, e, start, goal)
+    return get_current_engine().certify(program, e, start, goal)
 
 
 def reach(program: Program, e: FloatArray, target: Target, start: State) -> Reached:
@@ -242,7 +232,7 @@ def reach(program: Program, e: FloatArray, target: Target, start: State) -> Reac
     All actuators are free, and the platform has six freedoms or the poses keep the others. Limbs
     begin at the start's joint values. Closure with locked actuators is square.
     """
-    return _get_engine_for(program).reach(program, e, target, start)
+    return get_current_engine().reach(program, e, target, start)
 
 
 def linearize(
@@ -253,7 +243,7 @@ def linearize(
     e : (t | 1, n_displacements) [m, rad]. q : (t | 1, n, n_joints) actuated joint values [m, rad].
     free : eliminate the actuated joints too, at their values in `state`.
     """
-    return _get_engine_for(program).linearize(program, e, q, state, free)
+    return get_current_engine().linearize(program, e, q, state, free)
 
 
 def fold(factor: FloatArray, rows: FloatArray) -> FloatArray:
@@ -287,10 +277,7 @@ def differentiate(
     by_parameter, by_reading : (t, n, 6 nodes, p) and (t, n, 6 nodes, n_joints) twists per unit of
         each, node by node, zero outside their freedoms.
     """
-    differentiate = _get_engine_for(program).differentiate
-    if program.others:
-        return differentiate(program, e, q, state, inputs, nodes)
-    return differentiate(program, e, q, state, inputs)
+    return get_current_engine().differentiate(program, e, q, state, inputs, nodes)
 
 
 def fold_poses(
@@ -313,7 +300,7 @@ def fold_poses(
         was observed are finite. Its rows are zero elsewhere.
     """
     arguments = program, e, q, state, inputs, observed
-    return _get_engine_for(program).fold_poses(factor, *arguments)
+    return get_current_engine().fold_poses(factor, *arguments)
 
 
 def fold_compared(
@@ -334,7 +321,7 @@ def fold_compared(
     The state (1, n), and what `fold_poses` returns. None where the engine leaves this to these
     functions.
     """
-    current = _get_engine_for(program)
+    current = get_current_engine()
     if current.fold_compared is None or program.idle_groups:
         return None
     return current.fold_compared(factor, program, e, q, start, inputs, measured)
