@@ -288,15 +288,20 @@ class State:
     closure_sign: NDArray[np.int8]
     others: tuple[FloatArray, ...] = ()
 
+    def map(self, function: Callable[..., np.ndarray], *others: State) -> Self:
+        """Return the state each array of which is a function of the same array of all states."""
+
+        def apply(*arrays: Any) -> Any:
+            if isinstance(arrays[0], tuple):
+                return tuple(map(apply, *arrays))
+            return function(*arrays)
+
+        made = {f.name: [getattr(s, f.name) for s in (self, *others)] for f in fields(self)}
+        return replace(self, **{name: apply(*arrays) for name, arrays in made.items()})
+
     def select(self, shape: tuple[int, int], trial: np.ndarray, pose: np.ndarray) -> Self:
         """Return rows (trial, pose) of a state that broadcasts to a shape (t, n), as (rows, 1)."""
-
-        def chosen(a: Any) -> Any:
-            if isinstance(a, tuple):
-                return tuple(map(chosen, a))
-            return np.broadcast_to(a, (*shape, *a.shape[2:]))[trial, pose][:, None]
-
-        return replace(self, **{f.name: chosen(getattr(self, f.name)) for f in fields(self)})
+        return self.map(lambda a: np.broadcast_to(a, (*shape, *a.shape[2:]))[trial, pose][:, None])
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,9 +10,9 @@ is. Derivation: docs/theory/kinematics.md.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import reduce
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -247,13 +247,7 @@ def follow_by(
             new = replace(new, status=status)
         states.append(new)
 
-    def join(name: str) -> Any:
-        parts = [getattr(state, name) for state in states]
-        if isinstance(parts[0], tuple):
-            return tuple(np.concatenate(own, axis=1) for own in zip(*parts, strict=True))
-        return np.concatenate(parts, axis=1)
-
-    return State(**{f.name: join(f.name) for f in fields(State)})
+    return states[0].map(lambda *arrays: np.concatenate(arrays, axis=1), *states[1:])
 
 
 def _iterate(
