@@ -241,7 +241,11 @@ def transport_matrix(arm: FloatArray, rotation: FloatArray | None = None) -> Flo
     the new ones (default: base axes).
     """
     turned = np.eye(3) if rotation is None else rotation
-    return stack_blocks(((turned, None), (-(turned @ hat(arm)), turned)))
+    low = turned @ hat(arm)
+    out = np.zeros((*low.shape[:-2], 6, 6))
+    out[..., :3, :3] = out[..., 3:, 3:] = turned
+    out[..., 3:, :3] = -low
+    return out
 
 
 def differentiate_by_frames(T: FloatArray) -> FloatArray:
