@@ -169,10 +169,10 @@ def test_degrees_of_freedom_of_the_sum_are_those_of_the_guide(case):
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        ("{U: 16 um, k: 2}", "{U: 16 um, sd: 8 um}", "stated once"),
+        ("{U: 16 um, k: 2}", "{U: 16 um, sd: 8 um}", "has one form"),
         ("{U: 16 um, k: 2}", "{U: 16 um, k: 0}", "coverage factor"),
         ("{U: 16 um, k: 2}", "{U: 16 um, nu: 9}", "nu"),
-        ("{limit: 20 ppm}", "{mean: 3 ppm}", "stated once"),
+        ("{limit: 20 ppm}", "{mean: 3 ppm}", "has one form"),
         ("angle: 8 urad", "angle: 8 um", "angle"),
         ("# T_base_frame: {x: 1400 mm, y: -900 mm, z: 600 mm}\n", "", "station"),
     ],

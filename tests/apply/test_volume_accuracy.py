@@ -184,7 +184,7 @@ def test_a_limit_is_judged_by_the_drawn_errors() -> None:
         (lambda: Volume(radius=-1.0), "above 0"),
         (lambda: Volume(radius=np.inf), "above 0"),
         (lambda: Volume({"theta": (0.0, 0.1)}), "'x', 'y', 'z'"),
-        (lambda: Volume(BOX, radius=0.01), "two of x, y, z"),
+        (lambda: Volume(BOX, radius=0.01), "two controlled coordinates"),
         (lambda: Volume(values={"x": [0.0, 0.01]}, radius=0.01), "one value as center"),
         (lambda: Volume(values={"x": np.linspace(0, 0.01, 5000).tolist()}), "more than 4,096"),
         (lambda: [[0.0, 0.0]], "x, y, z"),
