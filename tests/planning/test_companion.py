@@ -217,8 +217,7 @@ def test_the_goal_ends_the_measuring_of_fit_poses() -> None:
     assert errors.position <= 2e-5
     assert numbers[0] == len(poses)  # the number to the goal was right from the beginning
     assert numbers == list(range(len(poses), 0, -1))
-    assert following.reason == "validate"
-    assert following.is_reached
+    assert (following.reason, following.left) == ("validate", 0)
     assert following.minutes is not None
     assert following.minutes > 2.0 * following.held_out
 

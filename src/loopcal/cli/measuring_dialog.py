@@ -12,7 +12,7 @@ import sys
 import threading
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 
@@ -20,9 +20,7 @@ from loopcal.cli.hints import with_hint
 from loopcal.cli.terminal import print_text, width
 from loopcal.errors import DataError, FileError, suggest_names
 from loopcal.findings import Finding, report_finding
-from loopcal.io.data.kind_settings import KindRows
 from loopcal.io.exports.growing_export import GrowingExport, read_new_rows
-from loopcal.io.exports.profile import Profile
 from loopcal.io.formats.gcode_program import format_move
 from loopcal.io.runs.session_folder import (
     LEFT_OUT,
@@ -69,21 +67,8 @@ POLL = 0.5
 """Seconds between two looks at a followed export."""
 
 
-@dataclass
-class FollowedExport:
-    """An export that an instrument writes, and how it is read."""
-
-    export: GrowingExport
-    profile: Profile
-    by_order: bool
-
-
-class Given(NamedTuple):
-    """What was typed, or a row of an export: its pose (empty for the suggested one) and cells."""
-
-    text: str = ""
-    pose: str = ""
-    cells: dict[str, str] | None = None
+Row = tuple[str, dict[str, str]]
+"""Pose of a row of an export, empty for the suggested one, and its cells."""
 
 
 @dataclass
@@ -92,8 +77,7 @@ class Dialog:
 
     task: CompanionTask
     journal: Journal
-    entry: KindRows
-    source: FollowedExport | None
+    export: GrowingExport | None
     gcode: bool
     is_silent: bool
     state: Companion = field(init=False)
@@ -118,51 +102,46 @@ class Dialog:
             self.progress = report_progress(self.state, following)
             self.say(*self.progress)
             pose = following.pose if self.chosen is None else self.chosen
-            if pose is None and self.source is not None:
+            if pose is None and self.export is not None:
                 return
             if pose is not None:
                 self._show_pose(pose)
             if not self._take(inputs, pose):
                 return
 
-    def _take(self, inputs: Iterator[Given], pose: int | None) -> bool:
+    def _take(self, inputs: Iterator[str | Row], pose: int | None) -> bool:
         """Take rows and commands until the state has changed; return whether to go on."""
         for given in inputs:
-            if given.cells is not None:
-                if self._measure(given.pose, given.cells, pose):
-                    return True
-                continue
-            word, _, name = given.text.partition(" ")
+            word, _, name = given.partition(" ") if isinstance(given, str) else ("", "", "")
             if word in ("quit", "exit", "q"):
                 return False
-            if word in ("help", "?", "h"):
-                self.say(*(f"  {word:10} {what}" for word, what in COMMANDS.items()))
+            if isinstance(given, tuple):
+                is_done = self._measure(*given, pose)
             elif word in ("back", "keep", "out"):
-                if self._decide(word):
-                    return True
+                is_done = self._decide(word)
             elif word == "skip" and pose is not None:
                 self.skipped.append(pose)
-                self.chosen = None
-                return True
+                self.chosen, is_done = None, True
             elif word == "pose":
-                if self._find_pose(name) is not None:
-                    self.chosen = self._find_pose(name)
-                    return True
-            elif self._type(given.text, pose):
+                self.chosen = self._find_pose(name)
+                is_done = self.chosen is not None
+            elif word in ("help", "?", "h"):
+                self.say(*(f"  {word:10} {what}" for word, what in COMMANDS.items()))
+                is_done = False
+            else:
+                is_done = self._type(given, pose)
+            if is_done:
                 return True
         return False
 
     def _type(self, text: str, pose: int | None) -> bool:
         """Take a typed row; return whether it was one."""
-        sheet, columns = self.journal.sheet, self.journal.columns
+        columns = self.journal.columns
         name, values = split_values(text, len(columns))
         if values is None:
-            headers = tuple(f"{name} [{sheet.units[name]}]" for name in columns)
-            shown = text if len(text) < 40 else f"{text[:40]}..."
-            facts = {"text": repr(shown), "columns": headers}
-            self.say(
-                report_finding("session.line-not-understood", **facts, commands=tuple(COMMANDS))
-            )
+            shown = repr(text if len(text) < 40 else f"{text[:40]}...")
+            facts = {"text": shown, "columns": self._list_headers(), "commands": tuple(COMMANDS)}
+            self.say(report_finding("session.line-not-understood", **facts))
             return False
         return self._measure(name, dict(zip(columns, values, strict=True)), pose)
 
@@ -185,7 +164,7 @@ class Dialog:
             self.say(report_finding("session.no-value"))
             return False
         is_known = name and any(v.pose == label and v.cells == cells for v in journal.visits)
-        if is_known and self.source is not None:
+        if is_known and self.export is not None:
             self.say(report_finding("session.row-identical", pose=label))
             return False
         journal.measure(label, cells)
@@ -243,92 +222,77 @@ class Dialog:
 
     def _show_pose(self, pose: int) -> None:
         """Show what to command for a pose, and ask for its values."""
-        sheet, label = self.journal.sheet, self.task.labels[pose]
+        sheet, label, robot = self.journal.sheet, self.task.labels[pose], self.task.robot
         row = sheet.pose_names().index(label)
-        readings = [
-            f"{a.name} {sheet.text(a.name)[row]} {sheet.units[a.name] or ''}".rstrip()
-            for a in self.task.robot.actuators
-            if a.name in sheet.units
-        ]
-        lines = [f"Command pose {label}: {', '.join(readings)}"]
+        names = [a.name for a in robot.actuators if a.name in sheet.units]
+        cells = (f"{n} {sheet.text(n)[row]} {sheet.units[n] or ''}".rstrip() for n in names)
+        lines = [f"Command pose {label}: {', '.join(cells)}"]
         if self.gcode:
-            unit: Literal["mm", "in"] = (
-                "in" if self.task.robot.units[Dimension.LENGTH] == "in" else "mm"
-            )
-            lines.append(
-                format_move(self.task.robot, self.task.problem.candidates.coordinates[pose], unit)
-            )
-        headers = " ".join(f"{name} [{sheet.units[name]}]" for name in self.journal.columns)
-        lines.append(f"Measured {headers}, or help:")
-        self.say(*lines)
+            coordinates = self.task.problem.candidates.coordinates[pose]
+            unit: Literal["mm", "in"] = "in" if robot.units[Dimension.LENGTH] == "in" else "mm"
+            lines.append(format_move(robot, coordinates, unit))
+        self.say(*lines, f"Measured {' '.join(self._list_headers())}, or help:")
+
+    def _list_headers(self) -> tuple[str, ...]:
+        units = self.journal.sheet.units
+        return tuple(f"{n} [{units[n]}]" if units[n] else n for n in self.journal.columns)
 
     def _show_verdict(self, verdict: Verdict, measured: Measurements) -> None:
         """Show measured and expected values of the last row, and what it says."""
         (observed,) = measured.observations
-        kind, prediction, sheet = observed.kind, verdict.prediction, self.journal.sheet
-        are_columns = [c.name for c in kind.columns] == list(prediction.names)
+        kind, found, units = observed.kind, verdict.prediction, self.journal.sheet.units
+        last = observed.measured[int(np.argmax(observed.rows))]
+        own = np.sqrt(np.maximum(found.sd**2 - found.noise**2, (1e-3 * found.noise) ** 2))
+        pairs = {"difference": (found.difference, found.sd)}
+        if [column.name for column in kind.columns] == list(found.names):
+            shown = {"measured": (last, found.noise), "expected": (verdict.expected, own)}
+            pairs = shown | pairs
         rows = []
-        for i, column in enumerate(kind.noise_columns):
-            if np.isnan(prediction.sd[i]):
-                continue
-            symbol = sheet.units.get(column.name) if are_columns else None
-            unit = (
-                self.task.robot.get_unit(column.dimension) if symbol is None else find_unit(symbol)
-            )
-            noise, sd = prediction.noise[i], prediction.sd[i]
-            own = np.sqrt(max(sd**2 - noise**2, (1e-3 * noise) ** 2))
-            pairs: list[tuple[float, float]] = [(prediction.difference[i], sd)]
-            if are_columns:
-                last = observed.measured[int(np.argmax(observed.rows))]
-                pairs = [(last[i], noise), (verdict.expected[i], own), *pairs]
-            cells = []
-            for value, spread in pairs:
-                if np.isfinite(spread):
-                    scaled = value / unit.factor_to_si, spread / unit.factor_to_si
-                    cells += [format_with_uncertainty(*scaled), format_uncertainty(scaled[1])]
-                else:
-                    cells += ["unknown", ""]
-            rows.append((column.name, unit.symbol, *cells))
-        titles = ("measured", "expected", "difference") if are_columns else ("difference",)
-        numbers = (Column(title) for name in titles for title in (name, "sd"))
+        for i in np.flatnonzero(~np.isnan(found.sd)):
+            column = kind.noise_columns[i]
+            symbol = units.get(column.name) or self.task.robot.get_unit(column.dimension).symbol
+            cells, factor = [column.name, symbol], find_unit(symbol).factor_to_si
+            for values, sds in pairs.values():
+                value, sd = values[i] / factor, sds[i] / factor
+                is_known = np.isfinite(sd)
+                cells.append(format_with_uncertainty(value, sd) if is_known else "unknown")
+                cells.append(format_uncertainty(sd) if is_known else "")
+            rows.append(tuple(cells))
+        numbers = (Column(title) for name in pairs for title in (name, "sd"))
         columns = (word_column("value"), word_column("unit"), *numbers)
         self.say(Table("", columns, tuple(rows)), *verdict.findings)
 
     # What comes in.
 
-    def _list_inputs(self) -> Iterator[Given]:
+    def _list_inputs(self) -> Iterator[str | Row]:
         """Give typed lines and rows of the export as they come; without an export until the input
         ends.
         """
         lines: queue.Queue[str | None] = queue.Queue()
-        source = self.source
 
         def read() -> None:
             for line in iter(sys.stdin.readline, ""):
-                lines.put(line)
+                lines.put(line.strip())
             lines.put(None)
 
         threading.Thread(target=read, daemon=True).start()
-        is_open = True
         while True:
-            if source is not None:
-                yield from self._follow(source)
+            if self.export is not None:
+                yield from self._follow(self.export)
             try:
-                line = lines.get(timeout=POLL if source is not None or is_open else None)
+                line = lines.get(timeout=POLL)
             except queue.Empty:
                 continue
-            if line is None:
-                if source is None:
-                    return
-                is_open = False
-            elif line.strip():
-                yield Given(line.strip())
+            if line is None and self.export is None:
+                return
+            if line:
+                yield line
 
-    def _follow(self, source: FollowedExport) -> Iterator[Given]:
+    def _follow(self, export: GrowingExport) -> Iterator[Row]:
         """Give the new rows of the export."""
-        new = read_new_rows(source.export, source.profile, self.entry, source.by_order)
-        source.export = new.export
+        new, journal = read_new_rows(export), self.journal
+        self.export = new.export
         self.say(*new.findings)
         for row in new.rows:
-            cells = convert_cells(row, new.units, self.journal.sheet, self.journal.columns)
-            yield Given(pose="" if source.by_order else row["pose"], cells=cells)
+            cells = convert_cells(row, new.units, journal.sheet, journal.columns)
+            yield row.get("pose", ""), cells

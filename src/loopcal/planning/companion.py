@@ -19,6 +19,7 @@ LEVEL (Bonferroni for both). Accuracy and next poses are those of `loopcal.plann
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -28,19 +29,12 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from loopcal.errors import DataError
-from loopcal.estimate.free_parameters import FreeParameters
-from loopcal.estimate.information import ObservedPoses, observe_poses
+from loopcal.estimate.information import ObservedPoses, observe_poses, observe_rows
 from loopcal.estimate.residual_test import FEWEST_DEGREES, SIGNIFICANCE
 from loopcal.findings import Finding, report_finding
-from loopcal.measure.initial_values import (
-    evaluate_measurements,
-    guess_nuisance_values_batch,
-    whiten_rows,
-)
+from loopcal.measure.initial_values import guess_nuisance_values_batch
 from loopcal.measure.instrument import Instrument
 from loopcal.measure.measurements import Measurements
-from loopcal.measure.nuisance import NuisanceParameters
-from loopcal.measure.observations import compute_whitener
 from loopcal.measure.readings import resolve_reading_sigma
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import read_coordinates
@@ -178,36 +172,33 @@ def solve_rows(rows: FloatArray, unit: FloatArray) -> PartialSolution:
     compared with these (FAR): rows are not linear so far, and what they say of it is second order.
     """
     k = rows.shape[1] - 1
-    length = np.linalg.norm(rows, axis=0)
-    length = np.where(length > 0.0, length, 1.0)
-    length[k] = 1.0
+    length = np.append(np.linalg.norm(rows[:, :k], axis=0), 1.0)
+    length[length == 0.0] = 1.0
     R = factor_square(rows / length)
     u, s, vt = np.linalg.svd(R[:k, :k])
     far = np.linalg.norm(vt / (length[:k] * unit), axis=1) > FAR * s
     known, along = are_nonzero(s) & ~far, u.T @ R[:k, k]
-    root = vt[known].T / s[known] / length[:k, None]
+    root, free = vt[known].T / s[known] / length[:k, None], vt[~known].T / length[:k, None]
     cost = float(R[k, k] ** 2 + (along[~known] ** 2).sum())
     degrees = int(rows.any(axis=1).sum()) - int(known.sum())
-    return PartialSolution(
-        -root @ along[known], root, vt[~known].T / length[:k, None], cost, degrees
-    )
+    return PartialSolution(-root @ along[known], root, free, cost, degrees)
 
 
 @dataclass(frozen=True, eq=False)
 class VisitFit:
     """The estimate from some visits, and the rows of all visits at it."""
 
-    deviation: FloatArray  # (p,) of the machine [tolerances]
-    setup: FloatArray  # (U,) [SI]
+    x: FloatArray  # (k,) setup [SI] and deviations of the machine [tolerances]
+    unit: FloatArray  # (k,) see `solve_rows`; infinite for the machine
     rows: VisitRows
     prior: FloatArray  # (., k + 1) whitened rows of the tolerances there
-    unit: FloatArray  # (k,) see `solve_rows`
+    cost: float  # sum of squares at x
     solution: PartialSolution
 
     @property
     def is_located(self) -> bool:
         """Whether the rows determine the setup."""
-        return not self.solution.open[: len(self.setup)].any()
+        return not self.solution.open[np.isfinite(self.unit)].any()
 
     @property
     def scale(self) -> tuple[float, float]:
@@ -220,89 +211,58 @@ class VisitFit:
         return float(np.sqrt(cost / degrees)), float(degrees)
 
 
-def observe_visits(
-    task: CompanionTask, measured: Measurements, deviation: FloatArray, setup: FloatArray
-) -> VisitRows:
-    """Return the rows of measured visits at deviations (p,) and a setup (U,)."""
-    free, nuisance = task.problem.free, measured.nuisance_parameters
-    (observed,) = measured.observations
-    joints = observed.kind.sensed_joints
-    order = np.argsort(observed.rows)
-    poses = _observe(free, deviation, measured.readings, joints)
-    raw, _ = _evaluate(poses, measured, nuisance, setup)
-    covariance = np.array(observed.covariance)
+def observe_visits(task: CompanionTask, measured: Measurements, x: FloatArray) -> VisitRows:
+    """Return the rows of measured visits at setup and machine x (k,)."""
+    (observed,), nuisance = measured.observations, measured.nuisance_parameters
+    setup, z = np.split(x, [len(nuisance)])
+    free, kind = task.problem.free, observed.kind
+    free = replace(free, robot=free.robot.with_values(free.values(z[None])[0]))
+    both = observed.present[:, :, None] & observed.present[:, None, :]
+    C = np.where(both, observed.covariance, 0.0) + ~both * np.eye(both.shape[1])
+    shape = (*observed.present.shape, len(x) + 1)
+
+    def evaluate(data: Measurements) -> tuple[ObservedPoses, FloatArray]:
+        poses = observe_poses(free, data.readings, kind.sensed_joints)
+        white = observe_rows(poses, data, nuisance, setup)[0].reshape(shape)
+        return poses, np.where(np.isfinite(white).all(axis=2, keepdims=True), white, 0.0)
+
+    poses, white = evaluate(measured)
     sigma = resolve_reading_sigma(free.robot, measured.reading_sigma, measured.n_poses)
-    for j in range(0 if sigma is None else sigma.shape[1]):
-        assert sigma is not None
-        change = np.zeros_like(sigma)
-        change[:, j] = np.where(np.isfinite(sigma[:, j]), sigma[:, j], 0.0)
-        moved = _observe(free, deviation, measured.readings + change, joints)
-        by = (_evaluate(moved, measured, nuisance, setup)[0] - raw)[..., -1]
-        covariance += by[:, :, None] * by[:, None, :]
-    present = observed.present & np.isfinite(raw).all(axis=2)
-    raw = np.where(present[..., None], raw, 0.0)
-    white = compute_whitener(covariance, present, np.ones(len(observed))) @ raw
-    values, kind = nuisance.select(0, setup[None]), observed.kind
-    noise = np.zeros((1, len(observed), len(kind.noise_columns)))
+    if sigma is not None:
+        L = np.linalg.cholesky(C)
+        for change in np.where(np.isfinite(sigma), sigma, 0.0) * np.eye(sigma.shape[1])[:, None]:
+            moved = evaluate(replace(measured, readings=measured.readings + change))[1]
+            by = L @ (moved - white)[..., -1:]
+            C = C + by @ by.swapaxes(1, 2)
+        wider = replace(measured, observations=(replace(observed, covariance=C),))
+        white = evaluate(wider)[1]
     own = kind.stack_joints(poses.joints, observed.rows)
+    noise = np.zeros((1, len(observed), len(kind.noise_columns)))
+    values = nuisance.select(0, setup[None])
     expected = kind.measure(poses.T[:, observed.rows], noise, values, own)[0]
-    return VisitRows(raw[order], white[order], covariance[order], expected[order])
-
-
-def _observe(
-    free: FreeParameters, deviation: FloatArray, readings: FloatArray, joints: Sequence[str]
-) -> ObservedPoses:
-    robot = free.robot.with_values(free.values(deviation[None])[0])
-    return observe_poses(replace(free, robot=robot), readings, joints)
-
-
-def _evaluate(
-    poses: ObservedPoses, measured: Measurements, nuisance: NuisanceParameters, setup: FloatArray
-) -> tuple[FloatArray, int]:
-    """Return rows (n, m, k + 1), not whitened, [setup | machine | residual], and p."""
-    linearized, u = poses.linearized, len(nuisance)
-    (evaluated,) = evaluate_measurements(
-        measured, linearized.T, setup[None], nuisance, linearized.joints
-    )
-    n, m = evaluated.residual.shape[1:]
-    plain = evaluated._replace(whitener=np.broadcast_to(np.eye(m), (n, m, m)))
-    rows = whiten_rows((plain,), linearized.by_parameters, linearized.joints_by_parameters)[0]
-    p = rows.shape[1] - u - 1
-    raw = np.concatenate([rows[:, p : p + u], rows[:, :p], rows[:, p + u :]], axis=1)
-    return raw.reshape(n, m, -1), p
-
-
-def _list_prior(
-    task: CompanionTask, nuisance: NuisanceParameters, deviation: FloatArray, setup: FloatArray
-) -> FloatArray:
-    """Return the whitened rows of the tolerances of machine and setup."""
-    table, machine = nuisance.table, task.problem.free.prior_rows()
-    stated = table.free & ~np.isnan(table.tolerance)
-    weight = np.diag(1.0 / np.where(stated, table.tolerance, 1.0))[stated]
-    u, p = len(setup), len(deviation)
-    of_setup = [weight, np.zeros((len(weight), p)), weight @ (setup - table.nominal)[:, None]]
-    of_machine = [np.zeros((len(machine), u)), machine, (machine @ deviation)[:, None]]
-    return np.concatenate([np.hstack(of_setup), np.hstack(of_machine)])
+    order = np.argsort(observed.rows)
+    raw = np.linalg.cholesky(C) @ white
+    return VisitRows(raw[order], white[order], C[order], expected[order])
 
 
 def linearize_visits(
-    task: CompanionTask,
-    measured: Measurements,
-    used: BoolArray,
-    deviation: FloatArray,
-    setup: FloatArray,
-) -> tuple[VisitFit, float]:
-    """Return the linear fit of the used visits (n,) at a point, and the sum of squares there."""
-    rows = observe_visits(task, measured, deviation, setup)
-    prior = _list_prior(task, measured.nuisance_parameters, deviation, setup)
+    task: CompanionTask, measured: Measurements, used: BoolArray, x: FloatArray | None = None
+) -> VisitFit:
+    """Return the linear fit of the used visits (n,) at x (k,), by default at nominal values."""
+    table, machine = measured.nuisance_parameters.table, task.problem.free.prior_rows()
+    stated, p = table.free & ~np.isnan(table.tolerance), machine.shape[1]
+    nominal = np.append(table.nominal, np.zeros(p))
+    x = nominal if x is None else x
+    P = np.zeros((int(stated.sum()) + len(machine), len(x)))
+    P[: -len(machine) or None, : len(table)] = np.diag(1.0 / table.tolerance)[stated]
+    P[len(P) - len(machine) :, len(table) :] = machine
+    prior = np.column_stack([P, P @ (x - nominal)])
+    rows = observe_visits(task, measured, x)
     stacked = np.concatenate([rows.white[used].reshape(-1, prior.shape[1]), prior])
-    is_length = [
-        p.dimension is Dimension.LENGTH for p in measured.nuisance_parameters.table.entries
-    ]
-    unit = np.full(len(setup) + len(deviation), np.inf)  # the machine is near its nominal values
-    unit[: len(setup)] = np.where(is_length, task.robot.size, 1.0)
-    solution, square = solve_rows(stacked, unit), float((stacked[:, -1] ** 2).sum())
-    return VisitFit(deviation, setup, rows, prior, unit, solution), square
+    size = {Dimension.LENGTH: task.robot.size}
+    unit = np.array([size.get(dimension, 1.0) for dimension in table.dimensions] + [np.inf] * p)
+    square = float((stacked[:, -1] ** 2).sum())
+    return VisitFit(x, unit, rows, prior, square, solve_rows(stacked, unit))
 
 
 def fit_visits(
@@ -310,28 +270,23 @@ def fit_visits(
 ) -> VisitFit:
     """Return the maximum a posteriori estimate from the used visits (n,).
 
-    start : where to begin; by default nominal geometry with the setup that fits best there.
+    start : where to begin; its setup counts if the rows determined it.
     """
-    free = task.problem.free
-    z = np.zeros(len(free)) if start is None else start.deviation
-    if start is not None and start.is_located:
-        setup = start.setup
-    else:
-        chosen = measured.take(used) if used.any() else measured
-        poses = _observe(free, z, chosen.readings, ())
+    best = linearize_visits(task, measured, used, None if start is None else start.x)
+    if (start is None or not start.is_located) and used.any():
+        chosen, (setup, z) = measured.take(used), np.split(best.x, [-len(task.problem.free)])
+        free = task.problem.free
+        robot = free.robot.with_values(free.values(z[None])[0])
+        T = observe_poses(replace(free, robot=robot), chosen.readings).T
         values = [rows.measured[None] for rows in chosen.observations]
-        setup = guess_nuisance_values_batch(chosen, values, poses.T, chosen.nuisance_parameters)[0]
-    best, square = linearize_visits(task, measured, used, z, setup)
-    u, share = len(setup), 1.0
+        setup = guess_nuisance_values_batch(chosen, values, T, chosen.nuisance_parameters)[0]
+        best = linearize_visits(task, measured, used, np.append(setup, z))
+    share = 1.0
     for _ in range(STEPS):
-        if square - best.solution.cost < SETTLED:
+        if best.cost - best.solution.cost < SETTLED:
             break
-        x = np.concatenate([best.setup, best.deviation]) + share * best.solution.step
-        fit, after = linearize_visits(task, measured, used, x[u:], x[:u])
-        if after < square:
-            best, square, share = fit, after, 1.0
-        else:
-            share *= 0.5
+        after = linearize_visits(task, measured, used, best.x + share * best.solution.step)
+        best, share = (after, 1.0) if after.cost < best.cost else (best, 0.5 * share)
     return best
 
 
@@ -380,20 +335,25 @@ class Companion:
     is_used: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=bool))
     fit: VisitFit | None = None
 
-    @cached_property
-    def pending(self) -> tuple[int, ...]:
-        """Places in the sheet of poses whose rows did not fit, and that have none that does."""
-        used = {pose for pose, is_used in zip(self.poses, self.is_used, strict=True) if is_used}
-        return tuple(dict.fromkeys(pose for pose in self.poses if pose not in used))
-
     @property
     def scale(self) -> float:
         """Noise in units of the stated one."""
         return 1.0 if self.fit is None else self.fit.scale[0]
 
-    def count_used(self, pose: int) -> int:
-        """Return how many used rows a pose has."""
-        return sum(p == pose and bool(u) for p, u in zip(self.poses, self.is_used, strict=True))
+    @cached_property
+    def used(self) -> tuple[int, ...]:
+        """Places in the sheet of the poses of all used rows."""
+        return tuple(self.poses[i] for i in np.flatnonzero(self.is_used))
+
+    @cached_property
+    def fitted(self) -> list[int]:
+        """Those that are fitted, in the order of measuring."""
+        return [pose for pose in self.used if not self.task.is_held_out[pose]]
+
+    @property
+    def pending(self) -> tuple[int, ...]:
+        """Places in the sheet of poses whose rows did not fit, and that have none that does."""
+        return tuple(dict.fromkeys(pose for pose in self.poses if pose not in self.used))
 
 
 def examine_row(before: Companion, measured: Measurements, pose: int) -> Verdict:
@@ -405,22 +365,13 @@ def examine_row(before: Companion, measured: Measurements, pose: int) -> Verdict
     poses, is_new = (*before.poses, pose), np.arange(n) == n - 1
     used = np.append(before.is_used, False)
     fitted = used & ~task.is_held_out[list(poses)]
-    nuisance = measured.nuisance_parameters
-    fit = before.fit
-    if fit is None:
-        none = np.zeros(n, dtype=bool)
-        nominal = np.zeros(len(task.problem.free)), nuisance.table.nominal
-        fit, _ = linearize_visits(task, measured, none, *nominal)
+    fit = linearize_visits(task, measured, fitted, None if before.fit is None else before.fit.x)
     if not fit.is_located:  # the new row locates the setup, too
-        fit = fit_visits(task, measured, fitted | is_new, before.fit)
-    fit, _ = linearize_visits(task, measured, fitted, fit.deviation, fit.setup)
-    setup, z = np.split(fit.solution.step, [len(fit.setup)])
-    expected = observe_visits(task, measured, fit.deviation + z, fit.setup + setup).expected[-1]
+        joined = fit_visits(task, measured, fitted | is_new, before.fit)
+        fit = linearize_visits(task, measured, fitted, joined.x)
+    expected = observe_visits(task, measured, fit.x + fit.solution.step).expected[-1]
     prediction, rows = predict_visit(measured, fit, n - 1), fit.rows
-    data: dict[str, Any] = {
-        "pose": task.labels[pose],
-        **_describe_worst(task.robot, measured, prediction),
-    }
+    data = {"pose": task.labels[pose], **_describe_worst(task.robot, measured, prediction)}
     same = [i for i in range(n - 1) if poses[i] == pose]
     doubted = [i for i in same if not used[i]]
 
@@ -441,7 +392,9 @@ def examine_row(before: Companion, measured: Measurements, pose: int) -> Verdict
         if earlier and compare_visits(rows, earlier[0], n - 1, fit.scale) < LEVEL:
             return conclude_drift(earlier[0])
         if prediction.degrees == 0:
-            return conclude("untestable", setup=tuple(_list_open(measured, fit)))
+            names = measured.nuisance_parameters.table.names
+            is_open = fit.solution.open[: len(names)].any(axis=1)
+            return conclude("untestable", setup=tuple(names[i] for i in np.flatnonzero(is_open)))
         return conclude("fits", earlier=len(doubted))
     agreeing = [i for i in same if compare_visits(rows, i, n - 1, fit.scale) >= LEVEL]
     if not doubted and not agreeing:
@@ -554,29 +507,19 @@ def find_suspects(fit: VisitFit, fitted: BoolArray, added: Sequence[int]) -> lis
 
 def _describe_worst(
     robot: Mechanism, measured: Measurements, prediction: Prediction
-) -> dict[str, object]:
+) -> dict[str, Any]:
     """Return the difference that is largest in its standard deviations, as data of a finding."""
     (observed,) = measured.observations
     ratio = np.nan_to_num(np.abs(prediction.difference) / prediction.sd)
-    worst = int(ratio.argmax())
-    dimension = observed.kind.noise_columns[worst].dimension
-    is_known = bool(ratio[worst] > 0.0)
-    pair = (float(prediction.difference[worst]), float(prediction.sd[worst]))
-    shown = [robot.to_quantity(value, dimension) for value in pair] if is_known else [None, None]
-    return {
-        "name": prediction.names[worst] if is_known else "",
-        "difference": shown[0],
-        "sd": shown[1],
-        "times": float(ratio[worst]) if is_known else float(np.sqrt(prediction.distance)),
-        "degrees": prediction.degrees,
-    }
-
-
-def _list_open(measured: Measurements, fit: VisitFit) -> list[str]:
-    """Return the setup parameters that the rows do not determine yet."""
-    names = measured.nuisance_parameters.table.names
-    is_open = fit.solution.open[: len(names)].any(axis=1)
-    return [names[i] for i in np.flatnonzero(is_open)]
+    worst, times = int(ratio.argmax()), float(np.sqrt(prediction.distance))
+    name, difference, sd = "", None, None
+    if ratio[worst] > 0.0:
+        name, times = prediction.names[worst], float(ratio[worst])
+        dimension = observed.kind.noise_columns[worst].dimension
+        pair = prediction.difference[worst], prediction.sd[worst]
+        difference, sd = (robot.to_quantity(float(value), dimension) for value in pair)
+    shared = {"times": times, "degrees": prediction.degrees}
+    return {"name": name, "difference": difference, "sd": sd, **shared}
 
 
 # Accuracy so far, and the next pose.
@@ -587,19 +530,12 @@ def predict_accuracy(companion: Companion, more: Sequence[int] = ()) -> Expected
     while nothing bounds them. Noise above the stated one widens them.
     """
     task, scale = companion.task, companion.scale
-    chosen = [*_list_fitted(companion), *more]
-    errors = task.problem.predict_errors(np.array(chosen, dtype=np.int64))
+    chosen = np.array([*companion.fitted, *more], dtype=np.int64)
+    errors = task.problem.predict_errors(chosen)
     if errors is None or scale == 1.0:
         return errors
     names = (f"{name}{rms}" for name in DIMENSIONS for rms in ("", "_rms"))
     return replace(errors, **{name: scale * getattr(errors, name) for name in names})
-
-
-def _list_fitted(companion: Companion) -> list[int]:
-    """Return the places of the poses of used rows that are fitted."""
-    held_out = companion.task.is_held_out
-    pairs = zip(companion.poses, companion.is_used, strict=True)
-    return [pose for pose, is_used in pairs if is_used and not held_out[pose]]
 
 
 Reason = Literal["repeat", "check", "best", "again", "validate", "done"]
@@ -615,7 +551,6 @@ class NextPose:
         the last pose is not allowed.
     left : number of fit poses to the goal, or of the sheet without a goal; None where MOST_REPEATS
         more do not reach it. held_out : number that is not measured. minutes : of both, if known.
-    is_reached : the goal.
     """
 
     reason: Reason
@@ -624,77 +559,51 @@ class NextPose:
     left: int | None
     held_out: int
     minutes: float | None
-    is_reached: bool
 
 
 def choose_next(companion: Companion, skipped: Sequence[int] = ()) -> NextPose:
     """Return what to measure next; `skipped` poses of the sheet are not suggested."""
     task, problem = companion.task, companion.task.problem
-    out, goal = task.is_held_out, problem.options.goal
-    measured = {pose for pose in companion.poses if companion.count_used(pose)}
-    at = problem.candidates.coordinates
+    goal, target, at = problem.options.goal, problem.options.target, problem.candidates.coordinates
     here = at[companion.poses[-1]] if companion.poses else locate_home(task.robot)
     minutes = task.pace.sum_minutes(1, measure_distance(task.robot, here[None], at))
-    free = [i for i in np.flatnonzero(~out).tolist() if i not in measured and i not in skipped]
-    validating = [i for i in np.flatnonzero(out).tolist() if i not in measured and i not in skipped]
-    errors = predict_accuracy(companion)
-    is_reached = bool(goal is not None and errors and errors.select(problem.options.target) <= goal)
-    order = [] if is_reached else order_by_gain(companion, free, minutes, goal is not None)
-    left: int | None = len(order)
-    if goal is not None and not is_reached:
-        low, high = 0, len(order)
-        target = problem.options.target
+    others = [i for i in range(len(at)) if i not in companion.used and i not in skipped]
+    free = [i for i in others if not task.is_held_out[i]]
+    validating = [i for i in others if task.is_held_out[i]]
+    order = order_by_gain(companion, free, minutes, goal is not None)
 
-        def is_enough(count: int) -> bool:
-            expected = predict_accuracy(companion, order[:count])
-            return expected is not None and expected.select(target) <= goal
+    def is_enough(count: int) -> bool:
+        errors = predict_accuracy(companion, order[:count])
+        return goal is not None and errors is not None and errors.select(target) <= goal
 
-        if not is_enough(high):
-            left = None
-        while left is not None and high - low > 1:
-            middle = (low + high) // 2
-            low, high = (low, middle) if is_enough(middle) else (middle, high)
-        left = None if left is None else high
+    left: int | None = len(free)
+    if goal is not None:
+        left = bisect_left(range(len(order) + 1), True, key=is_enough)
+        left = None if left > len(order) else left
     total = None
     if left is not None and task.pace.minutes is not None:
         path = [*order[:left], *validating]
         stops = np.concatenate([here[None], at[path]])
         travel = measure_distance(task.robot, stops[:-1], stops[1:]).sum()
         total = float(task.pace.sum_minutes(len(path), travel))
-    reason, pose = _choose_pose(companion, order, free, validating, skipped, minutes)
+    reason: Reason = "done"
+    pending = [pose for pose in companion.pending if pose not in skipped]
+    fitted, going = companion.fitted, order if left or (left is None and free) else []
+    since = companion.poses[::-1].index(fitted[0]) if fitted else 0
+    pose = None
+    if pending:
+        reason, pose = "repeat", pending[-1]
+    elif 0 < task.check_every <= since and (going or validating):
+        reason, pose = "check", fitted[0]
+    elif going:
+        reason, pose = "best" if going[0] in free else "again", going[0]
+    elif validating:
+        reason, pose = "validate", min(validating, key=lambda i: minutes[i])
     via_home = False
     if pose is not None and companion.poses:
-        path = check_paths(problem.candidates.checker, here[None], at[pose][None])
-        via_home = not bool(path.allowed[0])
-    return NextPose(reason, pose, via_home, left, len(validating), total, is_reached)
-
-
-def _choose_pose(
-    companion: Companion,
-    order: Sequence[int],
-    free: Sequence[int],
-    validating: Sequence[int],
-    skipped: Sequence[int],
-    minutes: FloatArray,
-) -> tuple[Reason, int | None]:
-    """Return what comes next, and why."""
-    every = companion.task.check_every
-    pending = [pose for pose in companion.pending if pose not in skipped]
-    if pending:
-        return "repeat", pending[-1]
-    fitted = _list_fitted(companion)
-    if every and fitted and (order or validating) and _count_since(companion, fitted[0]) >= every:
-        return "check", fitted[0]
-    if order:
-        return "best" if order[0] in free else "again", order[0]
-    if validating:
-        return "validate", min(validating, key=lambda i: minutes[i])
-    return "done", None
-
-
-def _count_since(companion: Companion, pose: int) -> int:
-    """Return the number of rows since a pose was measured last."""
-    return len(companion.poses) - 1 - max(i for i, p in enumerate(companion.poses) if p == pose)
+        straight = check_paths(problem.candidates.checker, here[None], at[pose][None])
+        via_home = not straight.allowed[0]
+    return NextPose(reason, pose, via_home, left, len(validating), total)
 
 
 def order_by_gain(
@@ -706,9 +615,9 @@ def order_by_gain(
     repeats : whether poses that were measured follow, up to MOST_REPEATS in all.
     """
     task, scaled = companion.task, companion.task.scaled
-    fitted, left, order = _list_fitted(companion), list(free), list[int]()
+    left, order = list(free), list[int]()
     usable = np.flatnonzero(~task.is_held_out & scaled.any(axis=(1, 2))).tolist()
-    rows = scaled[fitted].reshape(-1, scaled.shape[2])
+    rows = scaled[companion.fitted].reshape(-1, scaled.shape[2])
     most = max(len(left), MOST_REPEATS) if repeats else len(left)
     R = task.scoring.factor(rows)
     while len(order) < most and (left or usable):
@@ -735,20 +644,13 @@ def report_progress(companion: Companion, following: NextPose) -> tuple[Finding,
     else:
         shown = errors.to_quantities(task.robot)
         findings.append(report_finding("companion.accuracy", share=errors.share, errors=shown))
-    counts = {"left": following.left, "held_out": following.held_out, "minutes": following.minutes}
-    goal = None
+    goal, label, left = None, "", following.left
     if options.goal is not None:
         goal = task.robot.to_quantity(options.goal, DIMENSIONS[options.target])
-    if following.left is None:
-        findings.append(report_finding("companion.goal-far", goal=goal, repeats=MOST_REPEATS))
-    elif following.left == 0:
-        findings.append(report_finding("companion.enough", goal=goal, held_out=following.held_out))
-    else:
-        findings.append(report_finding("companion.left", goal=goal, **counts))
     if following.pose is not None:
-        label, via_home = task.labels[following.pose], following.via_home
-        said = report_finding(
-            "companion.next", pose=label, reason=following.reason, via_home=via_home
-        )
-        findings.append(said)
+        label = task.labels[following.pose]
+    code = "goal-far" if left is None else "left" if left else "enough"
+    facts = {**vars(following), "goal": goal, "pose": label, "repeats": MOST_REPEATS}
+    codes = (code, "next") if label else (code,)
+    findings += [report_finding(f"companion.{code}", **facts) for code in codes]
     return tuple(findings)

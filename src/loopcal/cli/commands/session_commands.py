@@ -67,7 +67,7 @@ def measure(
       loopcal measure plan -o session --minutes 2 --gcode
       loopcal measure plan -o session --follow points.txt --profile leica
     """
-    from loopcal.cli.measuring_dialog import Dialog, FollowedExport
+    from loopcal.cli.measuring_dialog import Dialog
     from loopcal.io.data.measurement_file import has_empty_readings, load_instrument_to_plan
     from loopcal.io.exports.conversion import read_sheet
     from loopcal.io.exports.growing_export import GrowingExport
@@ -88,11 +88,11 @@ def measure(
     table, entry = read_sheet(sheet, machine)
     if has_empty_readings(sheet, machine):
         raise FileError("this sheet asks for readings. Fill in the file itself", sheet)
-    source = None
+    export = None
     if follow is not None and profile is not None:
         read = read_profile(find_profile_file(profile))
         read = with_local_settings(read, unit, decimal == "comma")
-        source = FollowedExport(GrowingExport(follow), read, by_order)
+        export = GrowingExport(follow, read, entry, by_order)
     goal = {} if accuracy is None else dict(zip(("goal", "target"), accuracy, strict=True))
     task = prepare_task(
         lc.load_measurements(sheet, machine),
@@ -104,7 +104,7 @@ def measure(
     )
     is_silent = bool(click.get_current_context().params["as_json"])
     with open_session(output, table, [column.name for column in entry.kind.columns]) as journal:
-        dialog = Dialog(task, journal, entry, source, gcode, is_silent)
+        dialog = Dialog(task, journal, export, gcode, is_silent)
         dialog.run()
     visits = journal.visits
     used = sum(bool(visit.is_used) for visit in visits)

@@ -9,9 +9,10 @@ changed, the instrument began a new file, whose rows all count.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 from loopcal.errors import FileError
 from loopcal.findings import Finding, report_finding
@@ -24,68 +25,64 @@ from loopcal.io.exports.profile import Profile
 
 @dataclass(frozen=True)
 class GrowingExport:
-    """How far an export was read.
+    """An export that grows, how it is read, and how far it was read.
 
-    size, digest : of the bytes that were read. rows : number of its rows that were read.
-    misfits : number of lines that did not match the profile.
+    entry : kind and columns of the sheet that is filled in. by_order : whether names of points do
+    not count. size, digest : of the bytes that were read. rows, misfits : numbers of rows that were
+    read, and of lines that do not match the profile.
     """
 
     path: Path
+    profile: Profile
+    entry: KindRows
+    by_order: bool = False
     size: int = 0
     digest: str = ""
     rows: int = 0
     misfits: int = 0
 
 
-@dataclass(frozen=True)
-class NewRows:
-    """Rows that an export got: `rows` by column, with `pose` where they are named, and the `units`
-    of their columns. `export` : how far it is read now.
-    """
+class NewRows(NamedTuple):
+    """Rows that an export got, by column, with `pose` unless they are in the order of the poses."""
 
-    export: GrowingExport
-    rows: Sequence[Row]
-    units: dict[str, str | None]
-    findings: tuple[Finding, ...] = ()
+    export: GrowingExport  # how far it is read now
+    rows: Sequence[Row] = ()
+    units: Mapping[str, str | None] = {}
+    findings: Sequence[Finding] = ()
 
 
-def read_new_rows(
-    export: GrowingExport, profile: Profile, entry: KindRows, by_order: bool
-) -> NewRows:
-    """Return the rows that an export got since it was read last; none while it does not exist.
-
-    entry : kind and columns of the sheet that is filled in. FileError : it cannot be read.
-    """
-    path, k = export.path, max(len(getattr(entry.kind, "targets", ())), 1)
+def read_new_rows(export: GrowingExport) -> NewRows:
+    """Return the rows that an export got; none while it does not exist. FileError : unreadable."""
+    path, kind = export.path, export.entry.kind
     if not path.exists():
-        return NewRows(export, (), {})
-    content = read_bytes(path, "export", TABLE_SIZE)
-    one, two = (text.encode(profile.encoding) for text in ("x", "x\n"))  # with a byte order mark
-    end = content.rfind(two[len(one) :]) + 1
-    content = content[: end - 1 + len(two) - len(one) if end else 0]
-    is_same = hashlib.sha256(content[: export.size]).hexdigest() == export.digest
-    findings: list[Finding] = []
-    if export.size and not is_same:
+        return NewRows(export)
+    content, findings = read_bytes(path, "export", TABLE_SIZE), list[Finding]()
+    one, two = (text.encode(export.profile.encoding) for text in ("x", "x\n"))
+    mark = two[len(one) :]  # of the end of a line, without a byte order mark
+    place = content.rfind(mark)
+    content = content[: place + len(mark)] if place >= 0 else b""
+    if hashlib.sha256(content[: export.size]).hexdigest() != export.digest and export.size:
         findings.append(report_finding("session.export-began-again", path=str(path)))
-        export = GrowingExport(path)
+        export = replace(export, size=0, digest="", rows=0, misfits=0)
     if len(content) == export.size or not content.strip():
-        return NewRows(export, (), {}, tuple(findings))
-    misfits: list[tuple[str, int, str]] = []
+        return NewRows(export, findings=findings)
+    digest, misfits = hashlib.sha256(content).hexdigest(), list[tuple[str, int, str]]()
+    after = replace(export, size=len(content), digest=digest)
     try:
-        units, rows = read_points(path, profile, entry, by_order, misfits, content)
+        units, rows = read_points(
+            path, export.profile, export.entry, export.by_order, misfits, content
+        )
     except FileError as error:  # a header alone, or lines that do not match
-        if not misfits and not export.misfits:
+        if not export.misfits:
             findings.append(report_finding("session.no-line-matches", reason=str(error)))
-        export = GrowingExport(path, len(content), hashlib.sha256(content).hexdigest(), 0, 1)
-        return NewRows(export, (), {}, tuple(findings))
+        return NewRows(replace(after, misfits=1), findings=findings)
     for _, line, reason in misfits[export.misfits :]:
         findings.append(report_finding("session.line-misfit", line=line, reason=reason))
-    if by_order:
+    k = max(len(getattr(kind, "targets", ())), 1)
+    if export.by_order:
         sets = [rows[i : i + k] for i in range(0, len(rows) - k + 1, k)]
         rows = [{n: c for row in of for n, c in row.items() if c and n != "pose"} for of in sets]
-    columns = [column.name for column in entry.kind.columns]
-    if rows and k > 1 and not all(rows[-1].get(name) for name in columns):
+    if k > 1 and rows and not all(rows[-1].get(column.name) for column in kind.columns):
         rows = rows[:-1]  # more of its targets follow
-    digest = hashlib.sha256(content).hexdigest()
-    after = GrowingExport(path, len(content), digest, len(rows), len(misfits))
-    return NewRows(after, rows[export.rows :], dict(units), tuple(findings))
+    after = replace(after, rows=len(rows), misfits=len(misfits))
+    return NewRows(after, rows[export.rows :], units, findings)

@@ -1,0 +1,219 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The companion while measuring: how often it doubts rows, and how many poses a goal takes.
+
+Machines are drawn from the tolerances of the robot file. Each session measures the suggested poses
+until the goal is reached. A tenth of its rows is wrong in one value, by six standard deviations of
+the difference from the expected value, which the companion shows. The true error is that of the
+machine with the estimate at the end of the session, in the frame of the plan.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from loopcal.apply.simulated_measurements import (
+    InstrumentDescription,
+    build_instrument,
+    fill_in_measurements,
+)
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.observations import Observations
+from loopcal.planning import companion as co
+from loopcal.planning.constraints import PlanOptions
+from loopcal.planning.pose_planning import plan
+from loopcal.typing import FloatArray
+
+MACHINES, WRONG, SIGMAS = 100, 0.1, 6.0
+"""Sessions of each case, share of suggested rows that are wrong, and by how much."""
+
+DOUBTED = ("repeat", "differ")
+
+
+@dataclass(frozen=True)
+class Case:
+    """A robot whose tool point is measured, and the goal [m], rms over the workspace."""
+
+    robot: str
+    frames: tuple[str, ...]  # unknown ones
+    sigma: float  # [m]
+    goal: float
+    poses: int  # of the plan, for the fit
+
+
+CASES = (
+    Case("hexapod-42", (), 5e-6, 6e-6, 30),
+    Case("hexapod-42", ("base",), 5e-6, 7e-6, 30),
+    Case("linear-delta", ("base",), 2e-5, 1.5e-5, 20),
+    Case("five-bar", (), 2e-5, 1.5e-5, 16),
+)
+
+
+class Session:
+    """The planned poses of a case, and a machine at which they are measured."""
+
+    def __init__(self, case: Case) -> None:
+        self.case, self.robot = case, load_robot(case.robot)
+        described = InstrumentDescription(
+            ("position",), sigma_position=case.sigma, unknown_frames=case.frames
+        )
+        instrument = build_instrument(described)
+        self.exact = build_instrument(replace(described, sigma_position=1e-12))
+        options = PlanOptions(n_poses=case.poses, hold_out=5, n_candidates=300)
+        made = plan(self.robot, instrument, options=options)
+        sensor, poses = instrument.with_tool(self.robot).sensors[0], made.poses
+        self.kind = sensor.kind
+        rows = Observations.from_sigma(
+            sensor.kind, np.arange(len(poses)), np.zeros((len(poses), 3)), case.sigma, "", ""
+        )
+        self.planned = Measurements(
+            self.robot.name,
+            poses.readings,
+            (rows,),
+            labels=poses.labels,
+            is_held_out=poses.held_out,
+        )
+        goal = PlanOptions(goal=case.goal, target="position")
+        self.task = co.prepare_task(self.planned, self.robot, instrument, goal)
+        asked = replace(options, n_poses=None, goal=case.goal, target="position")
+        self.by_plan = plan(self.robot, instrument, options=asked).n_poses
+
+    def draw(self, seed: int) -> tuple[FloatArray, FloatArray]:
+        """Return the exact values (n, 3) [m] of a drawn machine, and its deviations (p,)."""
+        drawn = fill_in_measurements(
+            self.robot, self.planned, self.exact, draw_errors=True, seed=seed
+        )
+        free = self.task.problem.free
+        return drawn.data.observations[0].measured, free.deviation(drawn.truth.values[None])[0]
+
+    def to_visits(self, poses: list[int], values: list[FloatArray]) -> Measurements:
+        """Return visits of poses with their measured values [m]."""
+        n = len(poses)
+        rows = Observations.from_sigma(
+            self.kind, np.arange(n), np.array(values), self.case.sigma, "", ""
+        )
+        return Measurements(
+            self.robot.name,
+            self.planned.readings[poses],
+            (rows,),
+            is_held_out=self.planned.is_held_out[poses],
+        )
+
+    def measure(self, seed: int) -> dict[str, Any]:
+        """Return what happened in one session."""
+        exact, truth = self.draw(seed)
+        rng = np.random.default_rng([41, seed])
+        state, poses, values = co.Companion(self.task), list[int](), list[FloatArray]()
+        counts = dict.fromkeys(("right", "false", "wrong", "found", "untestable"), 0)
+        while (following := co.choose_next(state)).reason not in ("validate", "done"):
+            assert following.pose is not None
+            poses.append(following.pose)
+            values.append(exact[following.pose] + self.case.sigma * rng.normal(size=exact.shape[1]))
+            verdict = co.examine_row(state, self.to_visits(poses, values), poses[-1])
+            is_wrong = following.reason == "best" and rng.random() < WRONG
+            if is_wrong:
+                sd = verdict.prediction.sd
+                places = np.flatnonzero(np.isfinite(sd))
+                is_wrong = len(places) > 0
+                counts["untestable"] += not is_wrong
+                if is_wrong:
+                    place = rng.choice(places)
+                    values[-1] = values[-1].copy()
+                    values[-1][place] += SIGMAS * sd[place] * rng.choice([-1.0, 1.0])
+                    verdict = co.examine_row(state, self.to_visits(poses, values), poses[-1])
+            is_doubted = verdict.judgement in DOUBTED
+            counts["wrong" if is_wrong else "right"] += 1
+            counts["found" if is_wrong else "false"] += is_doubted
+            measured = self.to_visits(poses, values)
+            state = co.take_rows(self.task, measured, poses, verdict.is_used, state)
+        assert state.fit is not None
+        prediction = self.task.problem.prediction
+        change = prediction.position @ (state.fit.deviation - truth)
+        error = float(np.linalg.norm(change) / np.sqrt(len(prediction)))
+        return {**counts, "rows": len(poses), "error": error, "used": int(state.is_used.sum())}
+
+    def count_in_order(self) -> int:
+        """Return how many fit poses reach the goal in the order of the sheet."""
+        chosen: list[int] = []
+        for i in np.flatnonzero(~self.planned.is_held_out).tolist():
+            chosen.append(i)
+            errors = self.task.problem.predict_errors(np.array(chosen))
+            if errors is not None and errors.position <= self.case.goal:
+                break
+        return len(chosen)
+
+
+QUICK = {"MACHINES": 4, "CASES": CASES[:1]}
+
+
+def check(tables: dict[str, Any]) -> None:
+    """Assert what holds at the quick size."""
+    for row in tables["rows"]["rows"]:
+        assert row[5] > 0.9, row
+        assert row[3] < 0.1, row
+    for row in tables["poses"]["rows"]:
+        assert row[3] <= row[4], row
+
+
+def collect() -> dict:
+    """Compute the tables."""
+    of_rows, of_poses = [], []
+    for case in CASES:
+        session = Session(case)
+        done = [session.measure(seed) for seed in range(MACHINES)]
+        total = {name: sum(each[name] for each in done) for name in done[0]}
+        name = (case.robot, "unknown" if case.frames else "known")
+        shares = total["false"] / total["right"], total["found"] / max(total["wrong"], 1)
+        of_rows.append(
+            [*name, total["right"], shares[0], total["wrong"], shares[1], total["untestable"]]
+        )
+        rows = [each["rows"] for each in done]
+        good = float(np.mean([each["error"] <= case.goal for each in done]))
+        of_poses.append(
+            [
+                *name,
+                1e6 * case.goal,
+                float(np.median(rows)),
+                session.count_in_order(),
+                case.poses,
+                session.by_plan,
+                1e6 * float(np.median([each["error"] for each in done])),
+                good,
+            ]
+        )
+    return {
+        "seeds": [0, MACHINES],
+        "tables": {
+            "rows": {
+                "columns": [
+                    "robot",
+                    "frame of the instrument",
+                    "right rows",
+                    "doubted",
+                    "wrong rows",
+                    "repeated at once",
+                    "wrong, but not testable yet",
+                ],
+                "formats": ["", "", "d", ".1%", "d", ".1%", "d"],
+                "rows": of_rows,
+            },
+            "poses": {
+                "columns": [
+                    "robot",
+                    "frame of the instrument",
+                    "goal [um]",
+                    "rows with the companion (median)",
+                    "poses in the order of the sheet",
+                    "poses of the sheet",
+                    "poses of a plan for this goal",
+                    "true error at the end [um] (median)",
+                    "machines within the goal",
+                ],
+                "formats": ["", "", ".0f", ".0f", "d", "d", "d", ".2g", ".0%"],
+                "rows": of_poses,
+            },
+        },
+    }
