@@ -225,7 +225,7 @@ class Dialog:
         sheet, label, robot = self.journal.sheet, self.task.labels[pose], self.task.robot
         row = sheet.pose_names().index(label)
         names = [a.name for a in robot.actuators if a.name in sheet.units]
-        cells = (f"{n} {sheet.text(n)[row]} {sheet.units[n] or ''}".rstrip() for n in names)
+        cells = (f"{n}={sheet.text(n)[row]}{sheet.units[n] or ''}" for n in names)
         lines = [f"Command pose {label}: {', '.join(cells)}"]
         if self.gcode:
             coordinates = self.task.problem.candidates.coordinates[pose]

@@ -10,6 +10,7 @@ the session is resumed. The file is locked, so that one command at a time adds t
 
 from __future__ import annotations
 
+import errno
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -100,7 +101,7 @@ def write_line(descriptor: int, path: Path, line: str) -> None:
     with report_write_errors(path):
         try:
             if os.write(descriptor, content) < len(content):
-                raise OSError(28, os.strerror(28))  # no space left on the device
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
             os.fsync(descriptor)
         except OSError:
             os.ftruncate(descriptor, size)
@@ -123,31 +124,30 @@ def open_session(folder: Path, sheet: Table, columns: Sequence[str]) -> Iterator
     try:
         if lock(descriptor) is False:
             raise FileError(report_finding("session.in-use"), folder)
-        content = path.read_bytes()
-        whole = content.rfind(b"\n") + 1
-        if whole < len(content):  # a row that was not written to its end
-            os.ftruncate(descriptor, whole)
         header = {"event": None, "row": None, "pose": None, TIME: None}
         header |= {name: sheet.units[name] for name in columns}
-        journal = Journal(path, sheet, tuple(columns), descriptor)
         lines = [REMARK, "# format: 1", f"# sheet: {digest}", format_row(format_header(header))]
-        if content[:whole].count(b"\n") < len(lines):
+        begin, content = "".join(f"{line}\n" for line in lines).encode(), path.read_bytes()
+        if begin.startswith(content):  # nothing yet, or a header that was not written to its end
             os.ftruncate(descriptor, 0)
             write_line(descriptor, path, "\n".join(lines))
             sync_folder(folder)
-        _read_journal(journal, digest)
+        elif not content.startswith(REMARK.encode()):
+            raise FileError(report_finding("session.other-content"), folder)
+        elif not content.startswith(begin):
+            raise FileError(report_finding("session.other-sheet", sheet=str(sheet.path)), path)
+        elif not content.endswith(b"\n"):  # a row that was not written to its end
+            os.ftruncate(descriptor, content.rfind(b"\n") + 1)
+        journal = Journal(path, sheet, tuple(columns), descriptor)
+        _read_journal(journal)
         yield journal
     finally:
         os.close(descriptor)
 
 
-def _read_journal(journal: Journal, digest: str) -> None:
+def _read_journal(journal: Journal) -> None:
     """Enter the lines of a file."""
     table = read_template(journal.path)
-    if table.settings.content.get("sheet") != digest:
-        raise FileError(
-            report_finding("session.other-sheet", sheet=str(journal.sheet.path)), journal.path
-        )
     known = set(journal.sheet.pose_names())
     for row, cells in enumerate(table.rows):
         event, number, pose, time, *values = cells
