@@ -518,8 +518,7 @@ def _describe_worst(
         dimension = observed.kind.noise_columns[worst].dimension
         pair = prediction.difference[worst], prediction.sd[worst]
         difference, sd = (robot.to_quantity(float(value), dimension) for value in pair)
-    shared = {"times": times, "degrees": prediction.degrees}
-    return {"name": name, "difference": difference, "sd": sd, **shared}
+    return {"name": name, "difference": difference, "sd": sd, "times": times}
 
 
 # Accuracy so far, and the next pose.

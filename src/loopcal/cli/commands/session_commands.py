@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 from typing import Literal
 
@@ -105,7 +106,8 @@ def measure(
     is_silent = bool(click.get_current_context().params["as_json"])
     with open_session(output, table, [column.name for column in entry.kind.columns]) as journal:
         dialog = Dialog(task, journal, export, gcode, is_silent)
-        dialog.run()
+        with suppress(KeyboardInterrupt):  # each row is on the disk
+            dialog.run()
     visits = journal.visits
     used = sum(bool(visit.is_used) for visit in visits)
     data = output / DATA
