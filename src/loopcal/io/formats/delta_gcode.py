@@ -20,13 +20,12 @@ from __future__ import annotations
 
 import math
 import re
-from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import reduce
 from operator import xor
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 from loopcal.errors import FileError
 from loopcal.findings import Finding, report_finding
@@ -251,45 +250,93 @@ def _blank_asides(line: str) -> str:
 TOWERS, TRIMS = "XYZ", "ABC"
 
 
-Other = tuple[str, str, tuple[str, ...]]
-
-
-class DeltaFirmware(ABC):
+@dataclass(frozen=True)
+class DeltaFirmware:
     """Reader and writer of M665 and M666; the height of stop k is H + `sign` * adjustment_k.
 
-    `name` is that of the format, `program` that of the firmware, `remark` the first line of a new
-    file, `decimals` what the firmware keeps of a number in mm or degrees, `probe` the word that H
-    contains besides the height [mm], `others` the program, format and commands of the other one.
+    `name` is that of the format, `program` that of the firmware, `printed` where its words are,
+    `remark` the first line of a new file. `has_trims` where rod k is L plus its trim, in lines of
+    one command; otherwise L is one length, or a list. `decimals` : what the firmware keeps of a
+    number in mm or degrees. `choose_height` : of a stop without adjustment, from those of all
+    stops. `probe` : the word that H contains besides the height [mm]. `others` : the program,
+    format and commands of the other firmware. `ending`, `probes` : see `Format`.
     """
 
-    name: ClassVar[str]
-    program: ClassVar[str]
-    remark: ClassVar[str]
-    sign: ClassVar[float]
-    is_one_in_a_line: ClassVar[bool] = False
-    decimals: ClassVar[int]
-    probe: ClassVar[Name | None] = None
-    others: ClassVar[Other]
+    name: str
+    program: str
+    printed: str
+    remark: str
+    has_trims: bool
+    sign: float
+    decimals: int
+    choose_height: Callable[[Triple], float]
+    others: tuple[str, str, tuple[str, ...]]
+    ending: str
+    probes: str
+    probe: Name | None = None
 
-    @abstractmethod
-    def find_foreign(self, file: GcodeFile) -> Iterator[tuple[str, int]]:
-        """Yield what only the other firmware writes, with its line (from 0)."""
+    @property
+    def format(self) -> Format:
+        """The format."""
+        about = f"M665 and M666 of {self.program} ({self.printed})"
+        used = {"sigma_height": "", "sigma_tape": "arms", "probes": self.probes}
+        return Format(self.name, about, (self.ending,), self.read, self.write, read_options=used)
 
-    @abstractmethod
+    def find_foreign(self, file: GcodeFile) -> tuple[str, int] | None:
+        """Return what only the other firmware writes, with its line (from 0)."""
+        rod, front = file.values.get(("M665", "L")), file.commands["M665"][0]
+        if self.has_trims and rod is not None and ":" in rod.text:
+            return "a list of lengths in M665 L", rod.line
+        if not self.has_trims and re.match(r"\s*echo:", file.lines[front], re.IGNORECASE):
+            return "'echo:' in front of M665", front
+        known = ((c, file.commands[c][0]) for c in self.others[2] if c in file.commands)
+        return next(known, None)
+
     def refuse(self, file: GcodeFile) -> None:
-        """Raise FileError for words that contradict the firmware, or that loopcal lacks."""
+        """Refuse a single trim B, positive adjustments, or a tilted bed."""
+        for letter in "AB" if not self.has_trims else "":
+            if file.number("M666", letter, 0.0) != 0.0:
+                sentence = f"M666 {letter} tilts the bed, which a robot of the family linear-delta"
+                raise file.error(f"{sentence} lacks. Set it to 0 and probe again", "M666", letter)
+        if not self.has_trims:
+            return
+        if [letter for letter in TRIMS if file.has("M665", letter)] == ["B"]:
+            sentence = "M665 B without A and C is a radius in older Marlin and a rod trim in newer"
+            raise file.error(f"{sentence}. Remove it, or write all three", "M665", "B")
+        for tower in TOWERS:
+            if (adjustment := file.number("M666", tower, 0.0)) > 0:
+                sentence = f"M666 {tower} is {adjustment:g}, but is never positive in Marlin"
+                act = "(in RepRapFirmware it may be). Correct it"
+                raise file.error(f"{sentence} {act}", "M666", tower)
 
-    @abstractmethod
     def parse_arms(self, file: GcodeFile) -> Triple:
-        """Return the lengths of the arms [mm]."""
+        """Return the lengths of the arms [mm]: L plus each trim, or those of L, of which the
+        firmware uses the first for those that are left out.
+        """
+        if self.has_trims:
+            rod = file.number("M665", "L")
+            return tuple(rod + file.number("M665", letter, 0.0) for letter in TRIMS)
+        lengths = file.numbers("M665", "L", ":")
+        if len(lengths) > len(TOWERS):
+            sentence = f"L of M665 has {len(lengths)} lengths, but a delta of loopcal has three"
+            raise file.error(f"{sentence} towers. Remove the others", "M665", "L")
+        return lengths + lengths[:1] * (3 - len(lengths))
 
-    @abstractmethod
     def list_arms(self, arms: Triple, is_new: bool) -> tuple[Words, tuple[Finding, ...]]:
-        """Return the words of arms, in a new file or not, and what they need."""
-
-    @abstractmethod
-    def choose_height(self, stops: Triple) -> float:
-        """Return the height of a stop without adjustment, from those of all stops [mm]."""
+        """Return the words of arms, and what they need: one length where all are equal, with trims
+        only in an existing file.
+        """
+        is_equal = is_same(*((arm, arms[0]) for arm in arms))
+        code = "files.marlin-rod-trims" if self.has_trims else "files.reprap-rod-lengths"
+        findings = () if is_equal else (report_finding(code),)
+        if not self.has_trims:
+            texts = [format_number(arm) for arm in arms]
+            return {("M665", "L"): texts[0] if is_equal else ":".join(texts)}, findings
+        mean = arms[0] if is_equal else sum(arms) / 3
+        words: Words = {("M665", "L"): mean}
+        if not (is_equal and is_new):
+            words |= {("M665", t): arm - mean for t, arm in zip(TRIMS, arms, strict=True)}
+        return words, findings
 
     def load(self, path: Path) -> GcodeFile:
         """Read a file.
@@ -297,7 +344,7 @@ class DeltaFirmware(ABC):
         FileError : no M665, inches, a word that is not a number or contradicts the firmware.
         """
         lines = read_text(path, GcodeFile.what).splitlines(keepends=True)
-        file = GcodeFile.parse(lines, path, self.is_one_in_a_line)
+        file = GcodeFile.parse(lines, path, is_one_in_a_line=self.has_trims)
         number = file.number("M669", "K", math.nan)
         if number in range(len(KINEMATICS)) and KINEMATICS[int(number)] != "delta":
             finding = report_kinematics(KINEMATICS[int(number)], ())
@@ -308,12 +355,10 @@ class DeltaFirmware(ABC):
         if "G20" in file.commands:
             sentence = "G20 selects inches. Write the geometry in millimeters"
             raise FileError(sentence, path, file.commands["G20"][0] + 1)
-        program, format_name, commands = self.others
-        known = ((c, file.commands[c][0]) for c in commands if c in file.commands)
-        signs = (*self.find_foreign(file), *known)
-        for what, line in signs:
+        if foreign := self.find_foreign(file):
+            (what, line), (program, name, _) = foreign, self.others
             code = "files.other-firmware"
-            finding = report_finding(code, what=what, program=program, format=format_name)
+            finding = report_finding(code, what=what, program=program, format=name)
             raise FileError(finding, path, line + 1)
         self.refuse(file)
         return file
@@ -381,119 +426,31 @@ class DeltaFirmware(ABC):
         return tuple(height + self.sign * file.number("M666", t, 0.0) for t in TOWERS)
 
 
-class Marlin(DeltaFirmware):
-    """L is one length with trims; numbers of single precision resolve 0.00003 mm of 300 mm."""
-
-    name: ClassVar[str] = "marlin"
-    program: ClassVar[str] = "Marlin"
-    remark: ClassVar[str] = (
-        "; Delta geometry by loopcal, for Marlin without a bed probe: with one, add its Z offset "
-        "(M851) to H\n"
-    )
-    sign: ClassVar[float] = -1.0
-    is_one_in_a_line: ClassVar[bool] = True
-    decimals: ClassVar[int] = 4
-    probe: ClassVar[Name | None] = ("M851", "Z")
-    others: ClassVar[Other] = ("RepRapFirmware", "reprap", ("M307", "M584"))
-
-    def find_foreign(self, file: GcodeFile) -> Iterator[tuple[str, int]]:
-        """Yield a list of lengths."""
-        if ":" in (rod := file.values.get(("M665", "L"), Value("", 0, 0))).text:
-            yield "a list of lengths in M665 L", rod.line
-
-    def refuse(self, file: GcodeFile) -> None:
-        """Refuse a single trim B, and positive adjustments."""
-        if [letter for letter in TRIMS if file.has("M665", letter)] == ["B"]:
-            sentence = "M665 B without A and C is a radius in older Marlin and a rod trim in newer"
-            raise file.error(f"{sentence}. Remove it, or write all three", "M665", "B")
-        for tower in TOWERS:
-            if (adjustment := file.number("M666", tower, 0.0)) > 0:
-                sentence = f"M666 {tower} is {adjustment:g}, but is never positive in Marlin"
-                act = "(in RepRapFirmware it may be). Correct it"
-                raise file.error(f"{sentence} {act}", "M666", tower)
-
-    def parse_arms(self, file: GcodeFile) -> Triple:
-        """Return L plus each trim."""
-        rod = file.number("M665", "L")
-        return tuple(rod + file.number("M665", letter, 0.0) for letter in TRIMS)
-
-    def list_arms(self, arms: Triple, is_new: bool) -> tuple[Words, tuple[Finding, ...]]:
-        """Return L and the trims; L alone in a new file of equal arms."""
-        is_equal = is_same(*((arm, arms[0]) for arm in arms))
-        mean = arms[0] if is_equal else sum(arms) / 3
-        words: Words = {("M665", "L"): mean}
-        if not (is_equal and is_new):
-            words |= {("M665", t): arm - mean for t, arm in zip(TRIMS, arms, strict=True)}
-        return words, () if is_equal else (report_finding("files.marlin-rod-trims"),)
-
-    def choose_height(self, stops: Triple) -> float:
-        """Return the lowest, because adjustments are never positive."""
-        return min(stops)
-
-
-class RepRapFirmware(DeltaFirmware):
-    """L is a list of lengths; the firmware writes three decimals (M500)."""
-
-    name: ClassVar[str] = "reprap"
-    program: ClassVar[str] = "RepRapFirmware"
-    remark: ClassVar[str] = (
-        "; Delta geometry by loopcal; L with three lengths needs RepRapFirmware 2.03 or later\n"
-    )
-    sign: ClassVar[float] = 1.0
-    decimals: ClassVar[int] = 3
-    others: ClassVar[Other] = ("Marlin", "marlin", ("M851",))
-
-    def find_foreign(self, file: GcodeFile) -> Iterator[tuple[str, int]]:
-        """Yield the beginning of a report of Marlin."""
-        line = file.commands["M665"][0]
-        if re.match(r"\s*echo:", file.lines[line], re.IGNORECASE):
-            yield "'echo:' in front of M665", line
-
-    def refuse(self, file: GcodeFile) -> None:
-        """Refuse a tilted bed."""
-        for letter in "AB":
-            if file.number("M666", letter, 0.0) != 0.0:
-                sentence = f"M666 {letter} tilts the bed, which a robot of the family linear-delta"
-                raise file.error(f"{sentence} lacks. Set it to 0 and probe again", "M666", letter)
-
-    def parse_arms(self, file: GcodeFile) -> Triple:
-        """Return the lengths of L; the firmware uses the first for those that are left out."""
-        lengths = file.numbers("M665", "L", ":")
-        if len(lengths) > len(TOWERS):
-            sentence = f"L of M665 has {len(lengths)} lengths, but a delta of loopcal has three"
-            raise file.error(f"{sentence} towers. Remove the others", "M665", "L")
-        return lengths + lengths[:1] * (3 - len(lengths))
-
-    def list_arms(self, arms: Triple, is_new: bool) -> tuple[Words, tuple[Finding, ...]]:
-        """Return L: one length where all arms are equal."""
-        del is_new
-        texts = [format_number(arm) for arm in arms]
-        is_equal = len(set(texts)) == 1
-        words: Words = {("M665", "L"): texts[0] if is_equal else ":".join(texts)}
-        return words, () if is_equal else (report_finding("files.reprap-rod-lengths"),)
-
-    def choose_height(self, stops: Triple) -> float:
-        """Return the mean, because the firmware keeps the mean adjustment at zero."""
-        return sum(stops) / 3
-
-
-MARLIN, REPRAP = (
-    Format(
-        firmware.name,
-        f"M665 and M666 of {program} ({printed})",
-        (ending,),
-        firmware.read,
-        firmware.write,
-        read_options={"sigma_height": "", "sigma_tape": "arms", "probes": probes},
-    )
-    for firmware, program, printed, ending, probes in (
-        (Marlin(), "Marlin", "as M503 prints them", ".gcode", "G30, G33 P3 V0, M114"),
-        (
-            RepRapFirmware(),
-            "RepRapFirmware",
-            "config.g, config-override.g",
-            ".g",
-            "G32 or G30 S-1 with their points, heightmap.csv",
-        ),
-    )
-)
+MARLIN = DeltaFirmware(
+    "marlin",
+    "Marlin",
+    "as M503 prints them",
+    "; Delta geometry by loopcal, for Marlin without a bed probe: with one, add its Z offset "
+    "(M851) to H\n",
+    has_trims=True,
+    sign=-1.0,
+    decimals=4,  # single precision resolves 0.00003 mm of 300 mm
+    choose_height=min,  # adjustments are never positive
+    others=("RepRapFirmware", "reprap", ("M307", "M584")),
+    ending=".gcode",
+    probes="G30, G33 P3 V0, M114",
+    probe=("M851", "Z"),
+).format
+REPRAP = DeltaFirmware(
+    "reprap",
+    "RepRapFirmware",
+    "config.g, config-override.g",
+    "; Delta geometry by loopcal; L with three lengths needs RepRapFirmware 2.03 or later\n",
+    has_trims=False,
+    sign=1.0,
+    decimals=3,  # of M500
+    choose_height=lambda stops: sum(stops) / 3,  # it keeps the mean adjustment at zero
+    others=("Marlin", "marlin", ("M851",)),
+    ending=".g",
+    probes="G32 or G30 S-1 with their points, heightmap.csv",
+).format
