@@ -21,8 +21,7 @@ from loopcal.io.robot.robot_file import (
     KEYS,
     PLUS_MINUS,
     TABLE,
-    collect_meanings,
-    describe_type,
+    list_keys,
     name_record,
 )
 from loopcal.mechanism.families import FAMILIES
@@ -87,24 +86,18 @@ class SchemaMaker:
 
     def list_keys(self, record: type) -> Schema:
         """Return the schema of a record: its keys, which of them are needed, and their meaning."""
-        meanings, keys = collect_meanings(record), dict[str, Schema]()
-        for name, annotation in get_field_types(record).items():
-            text = "; ".join(filter(None, (meanings.get(name, ""), describe_type(annotation))))
-            keys[name] = {**self.describe(annotation), "description": text}
+        stated, hints, keys = list_keys(record), get_field_types(record), dict[str, Schema]()
+        for key in stated:
+            text = "; ".join(filter(None, (key.meaning, key.holds)))
+            keys[key.name] = {**self.describe(hints[key.name]), "description": text}
         older: Mapping[str, tuple[type, str]] = getattr(record, "OLDER_KEYS", {})
-        for key, (_, field) in older.items():
-            keys.setdefault(key, {**keys[field], "deprecated": True})
-        renamed = {field for _, field in older.values()}
-        absent = dataclasses.MISSING
-        needed = [
-            f.name.removesuffix("_")
-            for f in dataclasses.fields(record)
-            if f.init and f.default is absent and f.default_factory is absent
-        ]
+        for name, (_, field) in older.items():
+            keys.setdefault(name, {**keys[field], "deprecated": True})
+        needed = {key.name for key in stated if key.default == "needed"}
         return {
             "type": "object",
             "properties": keys,
-            "required": [name for name in needed if name not in renamed],
+            "required": sorted(needed - {field for _, field in older.values()}),
             "additionalProperties": getattr(record, "OTHER_KEYS", False),
         }
 

@@ -186,11 +186,6 @@ class ColumnSource:
         """Names in the export's header, or places counted from 1."""
         return _normalize_places(self.from_ if isinstance(self.from_, tuple) else (self.from_,))
 
-    def of_target(self, target: str) -> ColumnSource:
-        """Return the source of one target in a line of several."""
-        places = (p.replace(TARGET, target) if isinstance(p, str) else p for p in self.places)
-        return replace(self, from_=tuple(places))
-
     @property
     def symbol(self) -> str | None:
         """Unit of a number; None for text."""
@@ -292,10 +287,12 @@ class Profile:
         """
         if not any(TARGET in str(p) for source in self.columns.values() for p in source.places):
             return {"": self.columns}
-        return {
-            target: {name: source.of_target(target) for name, source in self.columns.items()}
-            for target in self.targets
-        }
+
+        def fill(source: ColumnSource, target: str) -> ColumnSource:
+            places = (p.replace(TARGET, target) if isinstance(p, str) else p for p in source.places)
+            return replace(source, from_=tuple(places))
+
+        return {t: {n: fill(of, t) for n, of in self.columns.items()} for t in self.targets}
 
     @cached_property
     def missing(self) -> tuple[str, ...]:
