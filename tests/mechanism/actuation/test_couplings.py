@@ -247,7 +247,12 @@ def test_two_fingers_on_one_motor_agree_with_their_drawing(tmp_path: Path) -> No
             "leave it 0 freedoms",
         ),
         (RACK, "sum: {slide: 1}", "sum: {slide: 1, arm.pinion: 2}", "under both"),
-        (RACK, "radius: {arm.pinion: -12}", "radius: {arm.way: -12}", "'arm.way' slides"),
+        (
+            RACK,
+            "radius: {arm.pinion: -12}",
+            "radius: {arm.way: -12}",
+            "radius of 'arm.way', which slides",
+        ),
         (
             RACK,
             "of: length, sum: {slide: 1}, radius: {arm.pinion: -12}",

@@ -721,13 +721,18 @@ def _name_joints(
                     f"{suggest_names(alias, list(known))}. Write limb.joint or the name of a drive"
                 )
             if joints[known[alias][0]].turns != part.turns:
-                has_radii = isinstance(stated, Radii)
-                remedy = "List it under `radius:`" if has_radii else "Sum joints of one kind"
-                raise refuse(
-                    f"adds angles, but {alias!r} slides. Give `of: length` or `reads: length`"
-                    if part.turns
-                    else f"adds lengths, but {alias!r} turns. {remedy}"
-                )
+                what, remedy = f"adds lengths, but {alias!r} turns", "Sum joints of one kind"
+                if part.word == "radius":
+                    what, remedy = (
+                        f"has a radius of {alias!r}, which slides",
+                        "List it under `sum:`",
+                    )
+                elif part.turns:
+                    what = f"adds angles, but {alias!r} slides"
+                    remedy = "Give `of: length` or `reads: length`"
+                elif isinstance(stated, Radii):
+                    remedy = "List it under `radius:`"
+                raise refuse(f"{what}. {remedy}")
             if not np.isfinite(weight):
                 raise stated.refuse(
                     key, f"gives {alias!r} the weight {weight:g}. Give a finite number"
