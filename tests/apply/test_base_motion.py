@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import loopcal as lc
-from loopcal.apply.base_motion import find_base_motion
+from loopcal.apply.base_motion import choose_base, find_base_motion
 from loopcal.geometry import exp_so3, make_pose
 
 TURN, SHIFT = np.array([0.002, -0.001, 0.003]), np.array([1e-3, 2e-3, -1.5e-3])
@@ -50,3 +50,13 @@ def test_motions_of_both_frames_are_stated_and_undone(base, platform, frames) ->
 def test_a_frame_that_was_measured_is_not_taken_for_a_convention() -> None:
     moved, robot = move_frames(F, np.eye(4)), lc.load_robot("hexapod-42")
     assert find_base_motion(robot, moved, False, ()) == (None, None)
+
+
+def test_a_table_leaves_out_motions_that_nobody_sees() -> None:
+    small = make_pose(np.eye(3), 1e-2 * SHIFT)
+    moved, robot = move_frames(small, np.eye(4)), lc.load_robot("hexapod-42")
+    result = {"expected_error": {"finding": {"data": {"fitted": ["base"]}}}}
+    assert choose_base(result, robot, moved, keep_frame=True) == (moved, ())
+    kept, findings = choose_base(result, robot, moved, keep_frame=True, visible=0.0)
+    assert not findings
+    np.testing.assert_allclose(kept.values, robot.values, rtol=0, atol=1e-10)  # [m]

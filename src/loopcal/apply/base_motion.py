@@ -32,7 +32,7 @@ from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.solutions import forward
 from loopcal.typing import BoolArray, FloatArray
 
-VISIBLE = 5e-4  # root mean square motion, in sizes of the robot, from which it is stated
+VISIBLE = 5e-4  # root mean square motion, in sizes of the robot, above which it is stated
 SAME = 1e-3  # largest remaining share of a motion that other values make exactly
 STEPS = 5  # of Newton's method for motions and for these values
 ROUNDING = 1e-9  # share of the robot's size below which a frame does not move
@@ -40,17 +40,22 @@ FRAMES = ("base", "platform")
 
 
 def choose_base(
-    result: Mapping[str, Any], initial: Mechanism, robot: Mechanism, keep_frame: bool
+    result: Mapping[str, Any],
+    initial: Mechanism,
+    robot: Mechanism,
+    keep_frame: bool,
+    visible: float = VISIBLE,
 ) -> tuple[Mechanism, tuple[Finding, ...]]:
     """Return the identified robot of a result (of its JSON), and whether its values move frames
-    that nothing measured; with `keep_frame` the robot with values that keep them.
+    that nothing measured; with `keep_frame` the robot with values that keep them. `visible` : root
+    mean square motion, in sizes of the robot, from which they move.
 
     DataError : no values do.
     """
     error = result.get("expected_error") or {}
     fitted = error.get("finding", {}).get("data", {}).get("fitted", ())
     is_planar = result.get("height_errors") is not None  # heights determine the rest
-    finding, kept = find_base_motion(initial, robot, is_planar, fitted)
+    finding, kept = find_base_motion(initial, robot, is_planar, fitted, visible)
     if finding is not None and keep_frame:
         if kept is None:
             raise DataError(finding)
@@ -59,7 +64,11 @@ def choose_base(
 
 
 def find_base_motion(
-    initial: Mechanism, robot: Mechanism, is_planar: bool, frames: Sequence[str] = FRAMES
+    initial: Mechanism,
+    robot: Mechanism,
+    is_planar: bool,
+    frames: Sequence[str] = FRAMES,
+    visible: float = VISIBLE,
 ) -> tuple[Finding | None, Mechanism | None]:
     """Return the motion of frames from an initial robot to the identified one, None where it is not
     visible, and the identified robot with values that do without it, or without its rotation alone;
@@ -88,7 +97,7 @@ def find_base_motion(
     M, P = _fit_motions(T, old.T[usable], arms, level, allowed)
     points = _place(T, arms)
     moved = _place(M @ T @ P, arms) - points
-    if np.sqrt((moved**2).sum(axis=1).mean()) < VISIBLE * robot.size:
+    if np.sqrt((moved**2).sum(axis=1).mean()) <= visible * robot.size:
         return None, None
     keeps, kept = "", None
     for word, share in (("both", 1.0), ("turn", 0.0)):

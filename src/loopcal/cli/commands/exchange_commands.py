@@ -471,10 +471,18 @@ def export(
         document = {"output": None, "format": target.name, "notes": [], "reasons": failures}
         return Output(document, list, [with_hint(failure) for failure in failures])
     run = load_run_or_robot(source)
-    robot, moved = choose_base(run.result, run.initial_robot, run.robot, keep_frame)
+    old = run.initial_robot if controller is None else lc.load_robot(controller)
+    settings = (
+        {"keep_frame": keep_frame} if target.table is None else {"keep_frame": True, "visible": 0.0}
+    )
+    try:  # a table leaves out any motion of frames, which are conventions
+        robot, moved = choose_base(run.result, old, run.robot, **settings)
+    except DataError:  # no values do without it
+        if keep_frame:
+            raise
+        robot, moved = choose_base(run.result, old, run.robot, keep_frame=False)
     loaded = build_source(replace(run, robot=robot))
     if target.table is not None:
-        old = run.initial_robot if controller is None else lc.load_robot(controller)
         tables, noted = make_tables(robot, old, TableSize(*target.table), table_error)
         stem = target.name if output is None else output.stem
         loaded, moved = replace(loaded, tables=tables, stem=stem), (*moved, noted)
