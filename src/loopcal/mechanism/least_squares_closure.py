@@ -200,19 +200,16 @@ def _differentiate_rows(rows: _Rows, moved: FloatArray) -> FloatArray:
         parts = slopes[:, counted], exact[:, counted], residual[:, counted]
         limbs.append(_Limb(*parts, counted, columns, unknown, places, width))
         u += len(passive)
-    bent, (N, _, width) = _bend(rows, limbs, u), moved.shape
-    J, dr, into = [], [], np.zeros((N, u, width))
-    for limb in limbs:
-        own = moved[:, limb.columns[M:] - M]
-        J.append(np.zeros((N, len(limb.rows), u)))
-        dr.append(np.zeros((N, len(limb.rows), u + width)))
-        J[-1][:, :, limb.places] = limb.J[:, :, limb.unknown]
-        dr[-1][:, :, limb.places] = limb.dr[:, :, limb.unknown]
-        dr[-1][:, :, u:] = limb.dr[:, :, M:] @ own
-        into[:, limb.places] += bent[:, limb.places][:, :, limb.columns[M:]] @ own
-    unknown = [column for limb in limbs for column in limb.columns[limb.unknown[M:]]]
-    both = np.concatenate([bent[:, :, [*range(M), *unknown]], into], axis=2)
-    return _solve(np.concatenate(J, axis=1), np.concatenate(dr, axis=1), both)
+    N, _, width = moved.shape
+    J, dr, bent = [], [], np.zeros((N, u, u + width))
+    for limb, bend in zip(limbs, _bend(rows, limbs), strict=True):
+        by_all = np.zeros((N, len(limb.columns), u + width))  # its columns, by unknowns and inputs
+        by_all[:, limb.unknown, limb.places] = 1.0
+        by_all[:, M:, u:] = moved[:, limb.columns[M:] - M]
+        J.append(limb.J @ by_all[..., :u])
+        dr.append(limb.dr @ by_all)
+        bent[:, limb.places] += bend @ by_all
+    return _solve(np.concatenate(J, axis=1), np.concatenate(dr, axis=1), bent)
 
 
 def _correct_slopes(
@@ -235,26 +232,24 @@ def _correct_slopes(
     return out
 
 
-def _bend(rows: _Rows, limbs: list[_Limb], u: int) -> FloatArray:
-    """Return (dJ)'r (N, u, columns) of the u unknowns; zero where the loops are closed, and by
-    displacements which no input moves.
+def _bend(rows: _Rows, limbs: list[_Limb]) -> list[FloatArray]:
+    """Return (dJ)'r (N, own unknowns, c) of each limb by its columns; zero where the loops are
+    closed, and by displacements which no input moves.
     """
     twists, size = rows.program.unknown_twists, rows.program.size
-    out = np.zeros((len(rows.x), u, len(twists) + rows.x.shape[1]))
+    out = [np.zeros((len(rows.x), len(own.unknown), len(own.columns))) for own in limbs]
     largest = max(np.nanmax(np.abs(limb.residual), initial=0.0) for limb in limbs)
     if largest <= CLOSED * size:
         return out
     for i in range(max(limb.moved for limb in limbs)):
-        moving = [limb for limb in limbs if i < limb.moved]
         # one length of the change for all limbs; of a joint an angle counts as its arc
         change = CHANGE * (1.0 if i < len(twists) and twists[i][1] < 3 else size)
-        columns = sorted({int(limb.columns[i]) for limb in moving})
+        columns = sorted({int(limb.columns[i]) for limb in limbs if i < limb.moved})
         ahead, behind = (rows.move(columns, sign * change).linearize() for sign in (1, -1))
-        for limb, more, less in zip(limbs, ahead, behind, strict=True):
+        for limb, bend, more, less in zip(limbs, out, ahead, behind, strict=True):
             if i < limb.moved:
                 slopes = (more - less)[:, limb.rows][:, :, limb.unknown].swapaxes(1, 2)
-                bent = (slopes @ limb.residual[..., None])[..., 0] / (2 * change)
-                out[:, limb.places, limb.columns[i]] += bent
+                bend[..., i] = (slopes @ limb.residual[..., None])[..., 0] / (2 * change)
     return out
 
 
