@@ -13,7 +13,7 @@ import numpy as np
 from loopcal.studies.executors import Answer, Executor, R, T
 from loopcal.studies.simulation.block import PosesTask, compute_task
 from loopcal.studies.simulation.machines import CellPoses
-from loopcal.studies.specification import COLUMNS
+from loopcal.studies.specification import read_columns
 from loopcal.typing import FloatArray
 
 
@@ -41,4 +41,4 @@ def leave_empty(task: Any) -> FloatArray | CellPoses:
     if isinstance(task, PosesTask):
         return compute_task(task)
     trials = json.loads(task.content)["trials"]
-    return np.zeros((trials, len(COLUMNS)))
+    return np.zeros((trials, len(read_columns()["every"])))

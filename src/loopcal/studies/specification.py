@@ -13,9 +13,11 @@ import hashlib
 import itertools
 import json
 import math
+import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
+from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, get_args, get_origin, get_type_hints
 
 import msgspec
@@ -518,52 +520,23 @@ class ScoreColumn:
     meaning: str
 
 
-COLUMNS = (
-    ScoreColumn("outcome", "1", "0 for a trial that converged, else the number of a code"),
-    ScoreColumn("position_before", "m", "held-out position error before calibration, rms"),
-    ScoreColumn("position_before_max", "m", "held-out position error before calibration, largest"),
-    ScoreColumn("position", "m", "held-out position error after calibration, rms"),
-    ScoreColumn("position_max", "m", "held-out position error after calibration, largest"),
-    ScoreColumn("orientation_before", "rad", "held-out rotation error before calibration, rms"),
-    ScoreColumn(
-        "orientation_before_max", "rad", "held-out rotation error before calibration, largest"
-    ),
-    ScoreColumn("orientation", "rad", "held-out rotation error after calibration, rms"),
-    ScoreColumn("orientation_max", "rad", "held-out rotation error after calibration, largest"),
-    ScoreColumn("parameters", "1", "error of the parameters over their tolerances, rms"),
-    ScoreColumn("parameters_max", "1", "error of the parameters over their tolerances, largest"),
-    ScoreColumn("lengths", "m", "error of the parameters that are lengths, rms"),
-    ScoreColumn("angles", "rad", "error of the parameters that are angles, rms"),
-    ScoreColumn("covered_parameters", "1", "share of the parameters in their 95 % intervals"),
-    ScoreColumn("covered_position", "1", "share of held-out poses with position error below U95"),
-    ScoreColumn(
-        "covered_orientation", "1", "share of held-out poses with rotation error below U95"
-    ),
-    ScoreColumn("rank", "1", "number of combinations of parameters that the data determine"),
-    ScoreColumn("condition", "1", "condition number of the scaled rows"),
-    ScoreColumn("iterations", "1", "steps of the fit"),
-    ScoreColumn("noise_scale", "1", "residuals over given noise"),
-)
-"""Columns of every study."""
-
-VERDICT_COLUMNS = (
-    ScoreColumn("verdict", "1", "0 calibrated, 1 with reservations, 2 undecided, 3 not calibrated"),
-)
-"""Further columns of a study that calibrates every trial in full."""
-
-BASE_COLUMNS = (
-    ScoreColumn("position_base_before", "m", "position error before, in the base frame, rms"),
-    ScoreColumn("position_base", "m", "position error after, in the base frame, rms"),
-    ScoreColumn("orientation_base_before", "rad", "rotation error before, in the base frame, rms"),
-    ScoreColumn("orientation_base", "rad", "rotation error after, in the base frame, rms"),
-)
-"""Further columns of a study that states errors in both frames."""
+@cache
+def read_columns() -> Mapping[str, tuple[ScoreColumn, ...]]:
+    """Return the columns of `scores.toml` by group: those of every study, of one that calibrates
+    every trial in full, and of one that states errors in both frames.
+    """
+    groups = tomllib.loads(Path(__file__).with_name("scores.toml").read_text("utf-8"))
+    return {
+        group: tuple(ScoreColumn(name, *of) for name, of in listed.items())
+        for group, listed in groups.items()
+    }
 
 
 def list_columns(scores: Scores) -> tuple[ScoreColumn, ...]:
     """Return the columns of the results of trials."""
-    verdict = VERDICT_COLUMNS if scores.verdict else ()
-    return (*COLUMNS, *verdict, *(BASE_COLUMNS if scores.frame == "both" else ()))
+    columns = read_columns()
+    verdict = columns["verdict"] if scores.verdict else ()
+    return (*columns["every"], *verdict, *(columns["base"] if scores.frame == "both" else ()))
 
 
 MORE_IS_BETTER = ("covered_", "rank")

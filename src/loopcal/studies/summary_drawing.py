@@ -28,11 +28,11 @@ from loopcal.report.figures.style import (
 from loopcal.report.pictures import render_figure
 from loopcal.results.tables import choose_unit
 from loopcal.studies.specification import (
-    BASE_COLUMNS,
     ScoreColumn,
     Study,
     check_question,
     list_chains,
+    read_columns,
 )
 from loopcal.studies.study_result import (
     FRAMES,
@@ -319,6 +319,6 @@ def _list_titles(study: Study, summary: StudySummary, column: ScoreColumn, width
     if column.name.startswith(IN_FRAME):
         frame = study.scores.frame
         if frame == "both":
-            frame = "base" if column in BASE_COLUMNS else "fitted"
+            frame = "base" if column in read_columns()["base"] else "fitted"
         lines += textwrap.wrap(FRAMES[frame], width)
     return [*lines, f"n = {trials} trials of each cell that did not fail; bars are 95 % intervals"]

@@ -438,7 +438,7 @@ def compute_block(task: BlockTask, threads: int = 1) -> FloatArray:
     scores: dict[str, Any] = dict.fromkeys(names, np.nan)
     scores |= score_poses(cell, trials, fits, stream) | score_parameters(cell, trials, fits)
     scores |= fits.scores
-    assert set(scores) == set(names), "a score needs its column in studies/specification.py"
+    assert set(scores) == set(names), "a score needs its column in studies/scores.toml"
     columns = np.broadcast_arrays(*(scores[name] for name in names))
     return np.stack(columns, axis=1)
 
