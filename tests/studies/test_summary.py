@@ -20,13 +20,13 @@ from scipy.stats import beta, binom
 
 from loopcal.errors import DataError
 from loopcal.report.pictures import render_figure
+from loopcal.report.words import say
 from loopcal.results.tables import render_text
 from loopcal.studies.files.store import read_store
 from loopcal.studies.simulation.block import OUTCOMES
 from loopcal.studies.specification import Cell, MethodLevel, NoiseLevel, PosesLevel, Question, Study
 from loopcal.studies.specification import Scores as ScoreSettings
 from loopcal.studies.study_result import (
-    FRAMES,
     MEMORY,
     CellSummary,
     Interval,
@@ -352,7 +352,7 @@ def test_the_title_states_score_and_frame_and_a_line_the_limit_of_the_question(
     assert figure.get_suptitle().splitlines() == [
         "Stated scores",
         "Held-out position error after calibration, rms",
-        FRAMES["base"],
+        say("study.frame-base"),
         "n = 20 trials of each cell that did not fail; bars are 95 % intervals",
     ]
     limits = [line for line in figure.axes[0].lines if np.array_equal(line.get_xdata(), [0, 1])]
@@ -365,9 +365,11 @@ def test_the_title_states_score_and_frame_and_a_line_the_limit_of_the_question(
 def test_scores_of_both_frames_have_the_frame_of_each_in_their_title(tmp_path: Path) -> None:
     result = store(tmp_path, scores=ScoreSettings(frame="both"))
     for score, frame in (("position", "fitted"), ("position_base", "base")):
-        assert FRAMES[frame] in " ".join(result.draw(score).get_suptitle().splitlines())
+        assert say(f"study.frame-{frame}") in " ".join(
+            result.draw(score).get_suptitle().splitlines()
+        )
     page = view_summary(result.study, result.summarize(), ("position_base",))
-    assert FRAMES["both"] in str(page[1])
+    assert say("study.frame-both") in str(page[1])
 
 
 @pytest.mark.parametrize(

@@ -194,7 +194,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
             command = find_command(words[0]) if words else None
             if isinstance(command, click.Group) and len(words) > 1:
                 command = command.commands.get(words[1], command)
-            if command is not None and not _has_working_folder():
+            has_folder = False  # from which relative paths count
+            with suppress(OSError):
+                has_folder = Path.cwd().is_dir()
+            if command is not None and not has_folder:
                 sentence = "the working folder has disappeared. Change to a folder that exists."
                 return _refuse(sentence, words)
             code = command_line.main(words, "loopcal", standalone_mode=False, obj=words)
@@ -205,13 +208,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return 1
         except (Exception, KeyboardInterrupt) as error:  # noqa: BLE001 the one place for all of them
             return _report(error, command, words, list_outputs())
-
-
-def _has_working_folder() -> bool:
-    """Return whether the working folder exists, from which relative paths count."""
-    with suppress(OSError):
-        return Path.cwd().is_dir()
-    return False
 
 
 def _report(

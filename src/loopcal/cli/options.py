@@ -81,15 +81,11 @@ def command(
             members |= entry.members if isinstance(entry, Group) else {key: entry}
         members["as_json"] = flag("Print one JSON document instead of text.", "--json")
         parameters = [entry.build(key) for key, entry in members.items()]
-        text = keep_blocks(function.__doc__ or "")
+        text = cleandoc(function.__doc__ or "")  # click does not wrap what follows a "\b"
+        text = re.sub(r"(?<=\n\n)(?=\S.*\n )", "\b\n", text)
         return (of or click).command(name, params=parameters, help=text)(run)
 
     return declare
-
-
-def keep_blocks(text: str) -> str:
-    """Return a help text in which click does not wrap paragraphs with an indented second line."""
-    return re.sub(r"(?<=\n\n)(?=\S.*\n )", "\b\n", cleandoc(text))
 
 
 def look_up(place: str) -> Any:

@@ -29,7 +29,6 @@ from loopcal.results.tables import (
     format_uncertainty,
     format_with_uncertainty,
     make_table,
-    word_column,
 )
 from loopcal.units import DISPLAY_UNITS, Dimension, Unit
 
@@ -262,24 +261,18 @@ def view_comparison(comparison: RunComparison) -> list[Block]:
     names = ", ".join(run.name for run in comparison.runs)
     findings = list_findings(sort_by_importance(comparison.findings))
     blocks: list[Block] = [f"Comparison of {names}.", "", *findings, ""]
-    blocks += [*format_list(_describe_runs(comparison)), "", build_estimates(comparison), ""]
+    blocks += [*format_list(list_runs(comparison)), "", build_estimates(comparison), ""]
     if any(pair.moved is not None for pair in comparison.pairs):
         blocks += [build_shifts(comparison), ""]
     return [*blocks, build_errors(comparison)]
 
 
-def _describe_runs(comparison: RunComparison) -> list[tuple[str, str]]:
+def list_runs(comparison: RunComparison) -> list[tuple[str, str]]:
     """Return each run with its robot, its verdict and its method."""
     return [
         (run.name, f"{run.robot}: {run.verdict}, {run.method.partition('(')[0]}")
         for run in comparison.runs
     ]
-
-
-def build_runs(comparison: RunComparison) -> Table:
-    """Return robot, verdict and method of each run."""
-    columns = (word_column(title, wraps=True) for title in ("run", "robot, verdict, method"))
-    return make_table("The compared runs", columns, _describe_runs(comparison))
 
 
 def build_estimates(comparison: RunComparison) -> Table:

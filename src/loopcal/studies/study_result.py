@@ -31,6 +31,7 @@ from loopcal.errors import DataError, StudyError
 from loopcal.findings import report_finding
 from loopcal.findings.catalog import find_entry
 from loopcal.io.core.text_file import replace_file, to_json, write_bytes, write_text
+from loopcal.report.words import say
 from loopcal.results.result import TableResult
 from loopcal.results.tables import (
     ABSENT,
@@ -734,14 +735,6 @@ def _count_reached(
     return (0, 0) if counted and not defined else (reached, trials)
 
 
-NOTE = (
-    "Shares of the simulated machines within the limit; failed trials count as outside. The "
-    "intervals of one row hold together with 95 % probability. The study contains no levels "
-    "between these."
-)
-
-EXTEND = "More machines decide an answer that is not certain (loopcal study extend)."
-
 SHOWN_UNITS = {"m": "um", "rad": "urad", "1": ""}
 """SI symbol of a score -> unit of its limit on the screen."""
 
@@ -752,8 +745,8 @@ def view_answers(answered: Sequence[AnsweredQuestion]) -> list[Block]:
     for item in answered:
         page += [item.title, tabulate_answers(item), ""]
     if any(answer.certainty == "between" for item in answered for answer in item.answers):
-        return [*page, f"{NOTE} {EXTEND}"]
-    return [*page, NOTE] if page else []
+        return [*page, f"{say('study.shares')} {say('study.extend')}"]
+    return [*page, say("study.shares")] if page else []
 
 
 def tabulate_answers(answered: AnsweredQuestion) -> Table:
@@ -809,18 +802,6 @@ JSON, CSV = "summary.json", "summary.csv"
 
 NO_FIGURES: Mapping[str, bytes] = {}
 
-SUMMARY_NOTE = (
-    "Medians of the trials that did not fail, before calibration of all trials, and their 95 % "
-    "intervals by the number of trials. Shares of coverage should be 0.95."
-)
-FRAMES = {
-    "fitted": "Pose errors exclude motions of frames that the measurements leave open.",
-    "base": "Pose errors are in the base frame.",
-    "both": "Pose errors exclude motions of frames that the measurements leave open. Errors "
-    "whose names contain 'base' are in the base frame.",
-}
-"""Frame of the scores of a study -> what the page says about it."""
-
 SHOWN = ("position", "orientation", "position_base", "covered_parameters")
 """Scores of the table on the screen by default."""
 
@@ -850,7 +831,7 @@ def view_summary(study: Study, summary: StudySummary, shown: Sequence[str]) -> l
     plural = "s" if len(study.cells) > 1 else ""
     page: list[Block] = [
         f"{study.title}: {len(study.cells)} cell{plural}, {summary.trials} trials{state}",
-        f"{SUMMARY_NOTE} {FRAMES[study.scores.frame]}",
+        f"{say('study.medians')} {say(f'study.frame-{study.scores.frame}')}",
         tabulate_medians(study, summary, shown),
     ]
     counts = sum((Counter(cell.failed) for cell in summary.cells), Counter[str]())

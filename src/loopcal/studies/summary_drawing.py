@@ -26,6 +26,7 @@ from loopcal.report.figures.style import (
     start_figure,
 )
 from loopcal.report.pictures import render_figure
+from loopcal.report.words import say
 from loopcal.results.tables import choose_unit
 from loopcal.studies.specification import (
     ScoreColumn,
@@ -34,14 +35,7 @@ from loopcal.studies.specification import (
     list_chains,
     read_columns,
 )
-from loopcal.studies.study_result import (
-    FRAMES,
-    UNITS,
-    CellSummary,
-    Interval,
-    StudySummary,
-    find_columns,
-)
+from loopcal.studies.study_result import UNITS, CellSummary, Interval, StudySummary, find_columns
 from loopcal.units import Unit
 
 if TYPE_CHECKING:
@@ -320,5 +314,5 @@ def _list_titles(study: Study, summary: StudySummary, column: ScoreColumn, width
         frame = study.scores.frame
         if frame == "both":
             frame = "base" if column in read_columns()["base"] else "fitted"
-        lines += textwrap.wrap(FRAMES[frame], width)
+        lines += textwrap.wrap(say(f"study.frame-{frame}"), width)
     return [*lines, f"n = {trials} trials of each cell that did not fail; bars are 95 % intervals"]

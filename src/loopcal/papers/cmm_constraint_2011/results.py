@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import groupby
 from time import process_time
 from typing import Any
@@ -748,42 +748,52 @@ def _draw_table_3(results: Results) -> published.Figure:
 
 def judge_claims(results: Results) -> tuple[published.Verdict, ...]:
     """Return a verdict for each claim."""
-    groups = [_judge_equations, _judge_table_3, _judge_experiment, _judge_methods]
-    return tuple(verdict for judge in groups for verdict in judge(results))
+    groups = [_judge_equations, _judge_table_3, _judge_experiment]
+    study, cell = results.study, results.figure_5
+    judge = partial(TEXT.judge, elsewhere=results.is_elsewhere, count=len(results.cells),
+                    parameters=len(study.planned.free), trials=results.trials, noise=cell.noise,
+                    errors=study.describe_errors(cell.size))  # fmt: skip
+    return tuple(verdict for group in groups for verdict in group(results, judge))
 
 
-def decide_all(decisions: Sequence[bool | None]) -> bool | None:
+Judge = Callable[..., published.Verdict]
+"""`PaperText.judge` with the sizes that several claims show."""
+
+
+def decide_all(decisions: Iterable[bool | None]) -> bool | None:
     """Return True if all are true, False if all are false, else None."""
+    decisions = list(decisions)
     return decide(all(d is True for d in decisions), all(d is False for d in decisions))
 
 
-def _judge_equations(results: Results) -> tuple[published.Verdict, ...]:
+def _judge_equations(results: Results, judge: Judge) -> Iterator[published.Verdict]:
     (points, rank), effect = results.pair, results.frame_effect
-    missing, judge = points - rank, TEXT.judge
-    last = [row["last"] for row in results.ranks]
-    regular = [decide(smallest > 1e-8, smallest < 1e-12) for smallest in last]
-    groups = [row["groups"] for row in results.ranks]
-    return (
-        judge("independent", decide(effect < 1e-9, effect > 1e-6), effect=effect),
-        judge("counted", decide(missing == 1, missing != 2), points=points, rank=rank,
-              missing=missing),
-        judge("least_squares", decide_all(regular), parameters=len(results.study.planned.free),
-              ranks=sorted({row["rank"] for row in results.ranks}), fewest=min(groups),
-              most=max(groups), largest=max(last), count=len(results.undetermined)),
-    )  # fmt: skip
+    yield judge("independent", decide(effect < 1e-9, effect > 1e-6), effect=effect)
+    missing = points - rank
+    yield judge("counted", decide(missing == 1, missing != 2), points=points, rank=rank,
+                missing=missing)  # fmt: skip
+    groups, last = zip(*((row["groups"], row["last"]) for row in results.ranks), strict=True)
+    yield judge("least_squares", decide_all(decide(x > 1e-8, x < 1e-12) for x in last),
+                ranks=sorted({row["rank"] for row in results.ranks}), fewest=min(groups),
+                most=max(groups), largest=max(last), count=len(results.undetermined))  # fmt: skip
 
 
-def _judge_table_3(results: Results) -> tuple[published.Verdict, ...]:
+def _judge_table_3(results: Results, judge: Judge) -> Iterator[published.Verdict]:
+    """Judge least squares and the prior on the machines of Table 3."""
     from scipy.stats import beta
 
-    study, cells, cell, judge = results.study, results.cells, results.figure_5, TEXT.judge
+    study, cells, cell = results.study, results.cells, results.figure_5
     p, left = len(study.planned.free), len(study.planned.free) - len(study.observable)
     stated, falls = PRINTED.number("figure_5", PARAMETERS, "stated"), results.reduce(PARAMETERS)
-    reached = decide_each(falls >= stated - 0.5, np.isfinite(falls))
     best = chance = 1.0
     if left:  # distribution of the share of undetermined directions in the squared norm
         share = beta(left / 2, (p - left) / 2)
         best, chance = 1.0 - np.sqrt(share.median()), share.cdf((1.0 - stated / 100.0) ** 2)
+    change = results.word_reduction(PARAMETERS)
+    yield judge("three_quarters", decide_each(falls >= stated - 0.5, np.isfinite(falls)),
+                stated=stated, left=left, best=100.0 * best, chance=100.0 * chance,
+                change=change)  # fmt: skip
+
     aligned = [name_measure(what, ALIGNED) for what in study.parts]
     better = {
         key: decide_share(results.pool(lambda draw, k=key: draw.cells[k].are_reduced(LS, aligned)))
@@ -791,60 +801,67 @@ def _judge_table_3(results: Results) -> tuple[published.Verdict, ...]:
     }
     worse = [f"errors {study.describe_errors(s)} with noise {n} mm"
              for (s, n), decision in better.items() if decision is False]  # fmt: skip
-    good, ranks = SIZES.find("good"), [
-        {m: rank_correlations(d.cells.values(), m) for m in METHODS} for d in results.draws
-    ]  # fmt: skip
-    of_ls = np.concatenate([of[LS] for of in ranks])
-    correlated = decide_each(of_ls > good, np.isfinite(of_ls))
     ratio = np.median([c.compute_median(LS, POSITION) / c.noise for c in cells.values()])
-    change, elsewhere = results.word_reduction(PARAMETERS), results.is_elsewhere
-    sizes = {"errors": study.describe_errors(cell.size), "noise": cell.noise,
-             "trials": results.trials}  # fmt: skip
-    figure, gains = PRINTED.find("figure_5"), [draw.gain for draw in results.draws]
-    each = np.min([results.reduce(name_measure(what, ABSOLUTE)) - float(figure[what]["stated"])
-                   for what in study.parts], axis=0)  # fmt: skip
+    yield judge("better", decide(True in better.values(), set(better.values()) == {False}),
+                better=sum(d is True for d in better.values()),
+                worse=worse or ["none"], parts=study.parts, ratio=ratio)  # fmt: skip
 
-    def word_poses(numbers: Mapping[str, float]) -> list[str]:
-        return [f"{what} {numbers[what]:.3g} {PARTS[what][2]}" for what in study.parts]
+    figure, absolute = PRINTED.find("figure_5"), {w: name_measure(w, ABSOLUTE) for w in study.parts}
+    each = np.min([results.reduce(measure) - float(figure[what]["stated"])
+                   for what, measure in absolute.items()], axis=0)  # fmt: skip
+    before = {
+        "before": {w: cell.compute_median(BEFORE, measure) for w, measure in absolute.items()},
+        "printed": {what: float(figure[what]["before"]) for what in study.parts},
+    }
+    yield judge("figure_5", decide_each(each >= -0.5, np.isfinite(each)),
+                stated=[f"{what} {figure[what]['stated']} %" for what in study.parts],
+                reductions=[f"{w} {results.word_reduction(m)}" for w, m in absolute.items()],
+                **{name: [f"{what} {x:.3g} {PARTS[what][2]}" for what, x in sizes.items()]
+                   for name, sizes in before.items()})  # fmt: skip
+    gains, (drawn, optimized) = [draw.gain for draw in results.draws], study.spreads
+    yield judge("exchange", [gain >= 3.0 for gain in gains], gain=gains[0], least=min(gains),
+                unit=study.unit[1], drawn=drawn, optimized=optimized)  # fmt: skip
 
-    return (
-        judge("three_quarters", reached, elsewhere=elsewhere, stated=stated, parameters=p,
-              left=left, best=100.0 * best, chance=100.0 * chance, change=change, **sizes),
-        judge("better", decide(True in better.values(), set(better.values()) == {False}),
-              elsewhere=elsewhere,
-              better=sum(d is True for d in better.values()), count=len(cells),
-              worse=worse or ["none"], parts=study.parts, ratio=ratio),
-        judge("figure_5", decide_each(each >= -0.5, np.isfinite(each)), elsewhere=elsewhere,
-              trials=results.trials,
-              stated=[f"{what} {figure[what]['stated']} %" for what in study.parts],
-              reductions=[f"{what} {results.word_reduction(name_measure(what, ABSOLUTE))}"
-                          for what in study.parts],
-              before=word_poses({what: cell.compute_median(BEFORE, name_measure(what, ABSOLUTE))
-                                 for what in study.parts}),
-              printed=word_poses({what: float(figure[what]["before"]) for what in study.parts})),
-        judge("exchange", [gain >= 3.0 for gain in gains], gain=gains[0], least=min(gains),
-              unit=study.unit[1], drawn=study.spreads[0], optimized=study.spreads[1]),
-        judge("correlation", correlated, elsewhere=elsewhere, good=good, count=len(cells),
-              ratios=len({c.ratio for c in cells.values()}),
-              ranks={m: take_median(r) for m, r in ranks[0].items()}, parameters=change,
-              position=results.word_reduction(name_measure("position", ABSOLUTE)),
-              aligned=results.word_reduction(POSITION), **sizes),
-    )  # fmt: skip
+    good = SIZES.find("good")
+    ranks = {m: [rank_correlations(draw.cells.values(), m) for draw in results.draws]
+             for m in METHODS}  # fmt: skip
+    of_ls = np.concatenate(ranks[LS])
+    yield judge("correlation", decide_each(of_ls > good, np.isfinite(of_ls)), good=good,
+                ratios=len({c.ratio for c in cells.values()}),
+                ranks={m: take_median(of[0]) for m, of in ranks.items()}, parameters=change,
+                position=results.word_reduction(name_measure("position", ABSOLUTE)),
+                aligned=results.word_reduction(POSITION))  # fmt: skip
+
+    def judge_prior(cell: Cell) -> list[bool | None]:
+        before, ls, prior = (cell.errors[m][POSITION] for m in (BEFORE, LS, PRIOR))
+        is_good = (prior <= (1.0 + sure) * ls) & (prior <= before)
+        return decide_each(is_good, cell.converged[LS] & cell.converged[PRIOR])
+
+    sure, hardest = SIZES.find("sure"), max(cells, key=lambda k: cells[k].ratio)
+    priors = [decide_share(results.pool(lambda draw, k=k: judge_prior(draw.cells[k])))
+              for k in cells]  # fmt: skip
+    lost = published.estimate_share(results.pool(
+        lambda draw: [x > 1.0 for x in draw.cells[hardest].compute_left(PRIOR, POSITION)]
+    ))  # fmt: skip
+    yield judge("prior", decide(all(d is True for d in priors), False in priors), sure=100 * sure,
+                better=priors.count(True), worse=priors.count(False), share=100.0 * lost.value,
+                errors=study.describe_errors(hardest[0]), noise=hardest[1],
+                left={m: cells[hardest].compute_median(m, POSITION)
+                      for m in (BEFORE, LS, PRIOR)})  # fmt: skip
 
 
-def _judge_experiment(results: Results) -> tuple[published.Verdict, ...]:
+def _judge_experiment(results: Results, judge: Judge) -> Iterator[published.Verdict]:
     """Judge iterations, time and full poses of the points of the experiment."""
-    fifties, study, elsewhere = results.draws[0].fifties, results.study, results.is_elsewhere
-    stated, falling, within = PRINTED.find("experiment"), dict[Any, bool | None](), []
-    most = int(stated["iterations"])
+    fifties, stated = results.draws[0].fifties, PRINTED.find("experiment")
+    most, falling, within = int(stated["iterations"]), list[bool | None](), []
     for groups in fifties:
         is_within = results.pool(lambda d, g=groups: d.fifties[g].is_within(most).tolist())
         within.append((name_planes(groups), published.estimate_share(is_within),
                        decide_share(is_within)))  # fmt: skip
         for frame in FRAMES:
-            measures = list_statistics(study, frame)
-            falling[groups, frame] = decide_share(results.pool(
-                lambda d, g=groups, m=measures: d.fifties[g].are_reduced(LS, m)))  # fmt: skip
+            measures = list_statistics(results.study, frame)
+            falling.append(decide_share(results.pool(
+                lambda d, g=groups, m=measures: d.fifties[g].are_reduced(LS, m))))  # fmt: skip
     places = {"ls": (ABSOLUTE, LS), "nominal": (AT_NOMINAL, LS), "aligned": (ALIGNED, LS),
               "prior": (ALIGNED, PRIOR), "absolute_prior": (ABSOLUTE, PRIOR)}  # fmt: skip
     changes = {
@@ -856,44 +873,13 @@ def _judge_experiment(results: Results) -> tuple[published.Verdict, ...]:
         ]
         for name, (frame, method) in places.items()
     }  # fmt: skip
+    yield judge("iterations", decide_all(decision for _, _, decision in within),
+                points=PRINTED.find("points", "measured"), stated=most, aligned=changes["aligned"],
+                shares=[f"{100 * s.value:.0f} % (95 % interval {100 * s.low:.0f} to "
+                        f"{100 * s.high:.0f} %) on {name}" for name, s, _ in within])  # fmt: skip
     seconds = [s for draw in results.draws for s in draw.seconds]
     limit, longest = float(stated["seconds"]), max(seconds)
-    return (
-        TEXT.judge("iterations", decide_all([decision for _, _, decision in within]),
-                   elsewhere=elsewhere, points=PRINTED.find("points", "measured"), stated=most,
-                   aligned=changes["aligned"],
-                   shares=[f"{100 * s.value:.0f} % (95 % interval {100 * s.low:.0f} to "
-                           f"{100 * s.high:.0f} %) on {name}" for name, s, _ in within]),
-        TEXT.judge("seconds", [s <= limit for s in seconds], stated=limit, longest=longest,
-                   ratio=limit / longest),
-        TEXT.judge("full_poses", decide_all(list(falling.values())), elsewhere=elsewhere,
-                   falling=sum(d is True for d in falling.values()),
-                   rising=sum(d is False for d in falling.values()), ways=len(falling), **changes),
-    )  # fmt: skip
-
-
-def _judge_methods(results: Results) -> tuple[published.Verdict]:
-    """Judge the prior."""
-    sure, cells, study = SIZES.find("sure"), results.cells, results.study
-
-    def judge_prior(cell: Cell) -> list[bool | None]:
-        before, ls, prior = (cell.errors[m][POSITION] for m in (BEFORE, LS, PRIOR))
-        good = (prior <= (1.0 + sure) * ls) & (prior <= before)
-        return decide_each(good, cell.converged[LS] & cell.converged[PRIOR])
-
-    priors = {
-        key: decide_share(results.pool(lambda draw, k=key: judge_prior(draw.cells[k])))
-        for key in cells
-    }
-    key = max(cells, key=lambda k: cells[k].ratio)  # the hardest
-    left = {m: cells[key].compute_median(m, POSITION) for m in (BEFORE, LS, PRIOR)}
-    worse = published.estimate_share(results.pool(
-        lambda draw: [x > 1.0 for x in draw.cells[key].compute_left(PRIOR, POSITION)]))  # fmt: skip
-
-    return (
-        TEXT.judge("prior", decide(all(d is True for d in priors.values()), False in
-                                   priors.values()), sure=100 * sure, count=len(cells),
-                   better=sum(d is True for d in priors.values()),
-                   worse=sum(d is False for d in priors.values()), share=100.0 * worse.value,
-                   errors=study.describe_errors(key[0]), noise=key[1], left=left),
-    )  # fmt: skip
+    yield judge("seconds", [s <= limit for s in seconds], stated=limit, longest=longest,
+                ratio=limit / longest)  # fmt: skip
+    yield judge("full_poses", decide_all(falling), falling=falling.count(True),
+                rising=falling.count(False), ways=len(falling), **changes)  # fmt: skip

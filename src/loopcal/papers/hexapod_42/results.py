@@ -9,10 +9,10 @@ Derivation: docs/theory/families.md.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -674,84 +674,59 @@ def judge_claims(results: Results) -> tuple[published.Verdict, ...]:
     """Return a verdict for each claim; those on the printed tables belong to their machine, and
     `OF_RULE` to the paper's rule.
     """
-    verdicts = (
-        *((_judge_table_4(results),) if results.setup.is_printed else ()),
-        *_judge_steps(results),
-        *_judge_methods(results),
-    )
     is_rule = results.setup.epsilon == PRINTED.number("threshold", "value")
-    return tuple(verdict for verdict in verdicts if is_rule or verdict.name not in OF_RULE)
+    return tuple(v for v in _judge_all(results) if is_rule or v.name not in OF_RULE)
 
 
-def _count(values: BoolArray) -> int:
-    return int(values.sum())
+def _judge_all(results: Results) -> Iterator[published.Verdict]:
+    setup, used, stated = results.setup, count_printed(), results.levels[STATED]
+    printed = PRINTED.number("threshold", "value")
+    rms = {key: draws.rms for key, draws in results.methods.items()}
+    judge = partial(TEXT.judge, elsewhere=not setup.is_printed, iterations=used, rms=rms,
+                    threshold=printed, noise=stated.limits[0], angle=stated.limits[1],
+                    parameters=int(setup.robot.parameters.free.sum()))  # fmt: skip
+    if setup.is_printed:  # the actual poses, by the largest difference in units of the last digit
+        fourth = results.comparisons["table_4"]
+        rows = np.array([not x.endswith("PT") and x.split()[0] != ODD_POSE
+                         for x in fourth.published.labels])  # fmt: skip
+        off = (abs(fourth.difference) / fourth.step)[rows].max() / (1.0 + published.ROUNDING)
+        good = fourth.within[rows]
+        yield judge("table_4", decide(off <= UNITS[0], off > UNITS[1]), row=ODD_POSE,
+                    agreeing=int(good.sum()), count=good.size)  # fmt: skip
 
-
-def _judge_table_4(results: Results) -> published.Verdict:
-    """Judge the actual poses of Table 4, by the largest difference in units of the last digit."""
-    fourth = results.comparisons["table_4"]
-    rows = np.array([not x.endswith("PT") and x.split()[0] != ODD_POSE
-                     for x in fourth.published.labels])  # fmt: skip
-    units = (abs(fourth.difference) / fourth.step)[rows].max() / (1.0 + published.ROUNDING)
-    good = fourth.within[rows]
-    return TEXT.judge("table_4", decide(units <= UNITS[0], units > UNITS[1]), row=ODD_POSE,
-                      agreeing=_count(good), count=good.size)  # fmt: skip
-
-
-def _judge_steps(results: Results) -> tuple[published.Verdict, ...]:
-    """Judge convergence and the stopping rule."""
-    setup, used, judge = results.setup, count_printed(), TEXT.judge
-    printed, elsewhere = PRINTED.number("threshold", "value"), not setup.is_printed
+    # convergence and the stopping rule
     exact, frozen = results.runs["exact"], results.runs["frozen"]
     counts = [run.count_needed(printed) for run in (exact, frozen)]
     units = list_raw_units(setup.robot.parameters.dimensions)
     largest = np.abs((setup.truth.values - exact.values) / units).max(axis=1)
     five = (abs(PRINTED.table("table_5", name).values).max() for name in ("before", "after"))
     share = 1e-3 / next(five) * next(five)
-    stated, noise = results.levels[STATED], PRINTED.number("noise", "value")
-    alone = results.methods["alone"]
-    return (
-        judge("exact", decide(largest[used] <= share * largest[0], largest[used] >= largest[0]),
-              iterations=used, largest=largest[used], more=largest[used + 1], share=100.0 * share),
-        judge("converges", alone.largest <= share, elsewhere=elsewhere,
-              parameters=_count(setup.robot.parameters.free), iterations=used, noise=noise,
-              ratio=np.median(alone.largest), share=100.0 * share),
-        judge("threshold", decide(counts == [used, used], used not in counts), elsewhere=elsewhere,
-              threshold=printed, iterations=used, exact=exact.integrated, frozen=frozen.integrated),
-        judge("threshold_noise", stated.needed <= used, elsewhere=elsewhere, noise=noise,
-              median=stated.median[3], angle=stated.limits[1]),
-    )  # fmt: skip
-
-
-def _judge_methods(results: Results) -> tuple[published.Verdict, ...]:
-    """Judge what calibration improves, for each draw of noise; a lost draw improves nothing."""
-    setup, elsewhere = results.setup, not results.setup.is_printed
     alone, together, before = (results.methods[key] for key in ("alone", "together", "before"))
-    rms = {key: draws.rms for key, draws in results.methods.items()}
-    at_measured = compute_rms(results.runs["exact"].pose_errors[0][:, :3] / MM)
-    residuals = results.levels[STATED].sizes[:, 0]
+    yield judge("exact", decide(largest[used] <= share * largest[0], largest[used] >= largest[0]),
+                largest=largest[used], more=largest[used + 1], share=100.0 * share)  # fmt: skip
+    yield judge("converges", alone.largest <= share, ratio=np.median(alone.largest),
+                share=100.0 * share)  # fmt: skip
+    yield judge("threshold", decide(counts == [used, used], used not in counts),
+                exact=exact.integrated, frozen=frozen.integrated)  # fmt: skip
+    yield judge("threshold_noise", stated.needed <= used, median=stated.median[3])
+
+    # what calibration improves, for each draw of noise; a lost draw improves nothing
+    yield judge("parameters_improve", alone.halved > 0.5,
+                smaller=100.0 * np.median(alone.smaller), halved=100.0 * np.median(alone.halved),
+                ratio=rms["alone"]["parameters"] / rms["before"]["parameters"])  # fmt: skip
+    at_measured = compute_rms(exact.pose_errors[0][:, :3] / MM)
+    residuals = stated.sizes[:, 0]
+    yield judge("poses_improve", residuals <= 0.5 * at_measured, before=at_measured,
+                after=np.median(residuals))  # fmt: skip
     improved = np.array([alone.places[name] < before.places[name] for name in before.places])
-    places = [
-        {"place": name, **{key: draws.rms[name] for key, draws in results.methods.items()}}
-        for name in before.places
-    ]
-    ratio = rms["alone"]["parameters"] / rms["together"]["parameters"]
-    least = results.poses[0]
-    own = next(row for row in results.poses if row["poses"] == MEASURED)
-    left = least["left"]
+    places = [{"place": name, **{key: of[name] for key, of in rms.items()}}
+              for name in before.places]  # fmt: skip
+    yield judge("positions_improve", improved.all(axis=0), places=places)
+    yield judge("leg_by_leg", alone.parameters <= AS_GOOD * together.parameters,
+                ratio=rms["alone"]["parameters"] / rms["together"]["parameters"])  # fmt: skip
+    least, left = results.poses[0], results.poses[0]["left"]
     enough = decide(
         left is not None and left < EXACT, left is None or left >= rms["before"]["parameters"]
     )
-    return (
-        TEXT.judge("parameters_improve", alone.halved > 0.5, elsewhere=elsewhere,
-                   noise=results.levels[STATED].limits[0],
-                   smaller=100.0 * np.median(alone.smaller), halved=100.0 * np.median(alone.halved),
-                   ratio=rms["alone"]["parameters"] / rms["before"]["parameters"], rms=rms),
-        TEXT.judge("poses_improve", residuals <= 0.5 * at_measured, elsewhere=elsewhere,
-                   before=at_measured, after=np.median(residuals)),
-        TEXT.judge("positions_improve", improved.all(axis=0), elsewhere=elsewhere, places=places),
-        TEXT.judge("leg_by_leg", alone.parameters <= AS_GOOD * together.parameters, ratio=ratio,
-                   rms=rms),
-        TEXT.judge("fewest_poses", enough, elsewhere=elsewhere, least=least, own=own,
-                   parameters=_count(setup.robot.parameters.free)),
-    )  # fmt: skip
+    own = next(row for row in results.poses if row["poses"] == MEASURED)
+    yield judge("fewest_poses", enough, least=least, own=own)

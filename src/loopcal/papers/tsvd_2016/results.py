@@ -101,12 +101,17 @@ def compute(
     seed: int, trials: int, progress: Callable[[str], None], case: StudyCase | None = None
 ) -> Results:
     """Compute everything."""
+    if case is None or case.robot is None:
+        designs = [*map(steps.load_design, steps.ROBOTS)]
+    else:
+        designs = [steps.adapt_design(case)]
     draws = {design.name: steps.simulate_machines(design, seed, trials, progress)
-             for design in steps.list_designs(case)}  # fmt: skip
+             for design in designs}  # fmt: skip
     progress("ridge steps")
     followed = steps.follow_ridge([*draws.values()][-1][0])
-    is_adapted = case is not None and case.robot is not None
-    return Results(draws, followed, steps.PRINTED.table("appendix_1"), is_adapted)
+    return Results(
+        draws, followed, steps.PRINTED.table("appendix_1"), designs[0].errors is not None
+    )
 
 
 def show_number(value: float) -> published.Cell:

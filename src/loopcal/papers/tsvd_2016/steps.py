@@ -177,13 +177,6 @@ def adapt_design(case: StudyCase) -> Design:
     return design
 
 
-def list_designs(case: StudyCase | None) -> tuple[Design, ...]:
-    """Return the manipulators of the paper, or the robot that replaces them."""
-    if case is None or case.robot is None:
-        return tuple(map(load_design, ROBOTS))
-    return (adapt_design(case),)
-
-
 @dataclass(frozen=True, eq=False)
 class Study:
     """t machines of one structure, measured."""

@@ -57,10 +57,10 @@ from loopcal.report.scene.scene import Scene, draw_scene, format_scene
 from loopcal.report.validation_view import (
     build_errors,
     build_estimates,
-    build_runs,
     build_shifts,
     describe_commanded,
     describe_improvements,
+    list_runs,
     view_error_statistics,
     view_errors,
 )
@@ -547,6 +547,8 @@ def build_comparison_document(comparison: RunComparison, made_by: str) -> Docume
     result: list[Element] = [say("comparison.meaning")]
     if findings := sort_by_importance(comparison.findings):  # the most important first
         result.append(Listing(tuple((f.severity.value, str(f)) for f in findings)))
+    columns = (word_column(title, wraps=True) for title in ("run", "robot, verdict, method"))
+    result.append(make_table("The compared runs", columns, list_runs(comparison)))
     estimates = show_figure(draw_run_parameters(comparison), "estimates-figure")
     shifts: list[Element] = [say("comparison.no-shift")]
     if any(pair.moved is not None for pair in comparison.pairs):
@@ -556,7 +558,7 @@ def build_comparison_document(comparison: RunComparison, made_by: str) -> Docume
     if any(run.common or run.own for run in comparison.errors):
         errors.append(show_figure(draw_run_errors(comparison), "errors-figure"))
     sections: dict[tuple[str, str], list[Element]] = {
-        ("result", "Changes of the machine"): [*result, build_runs(comparison)],
+        ("result", "Changes of the machine"): result,
         ("parameters", "Parameters side by side"): [build_estimates(comparison), estimates],
         ("shifts", "Shifts in standard deviations"): shifts,
         ("errors", "Held-out errors"): errors,

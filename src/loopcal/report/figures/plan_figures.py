@@ -204,8 +204,12 @@ def draw_surface_plan(plan: SurfacePlan) -> Figure:
     ]
     figure, (panels,) = start_panels(12.6, 5.0, 1, len(VIEWS))
     for axes, view in zip(panels, VIEWS, strict=True):
-        for points, style in zip(places[:, :, view], styles, strict=True):
-            _draw_group(axes, points, *style)
+        for points, (color, marker) in zip(places[:, :, view], styles, strict=True):
+            axes.plot(*points[:2].T, "-", color=color, lw=2.2, zorder=2)
+            for point in points[2:]:  # a fan of thin lines in the plane
+                ends = np.stack([points[0], point])
+                axes.plot(*ends.T, "-", color=color, lw=THIN, alpha=0.6, zorder=1)
+            axes.plot(*points.T, marker, color=color, ms=DOT + LINE, ls="none", zorder=3)
         _number_surfaces(axes, places[:, 0, view])
         axes.set_aspect("equal", adjustable="datalim")
         axes.margins(0.12)
@@ -223,14 +227,6 @@ def draw_surface_plan(plan: SurfacePlan) -> Figure:
     groups, points = plan.poses.groups.shape
     planes = f"{name_count(groups, 'plane')} with a perpendicular line"
     return finish_figure(figure, f"{plan.robot.name}: {planes}, n = {points} points in each")
-
-
-def _draw_group(axes: Axes, points: FloatArray, color: str, marker: str) -> None:
-    """Draw the points (k, 2) of a group: a thick line, and a fan of thin ones in the plane."""
-    axes.plot(*points[:2].T, "-", color=color, lw=2.2, zorder=2)
-    for point in points[2:]:
-        axes.plot(*np.stack([points[0], point]).T, "-", color=color, lw=THIN, alpha=0.6, zorder=1)
-    axes.plot(*points.T, marker, color=color, ms=DOT + LINE, ls="none", zorder=3)
 
 
 def _number_surfaces(axes: Axes, first: FloatArray) -> None:

@@ -183,14 +183,13 @@ def compute_motion(robot: Mechanism, change: FloatArray, name: str, text: str) -
 
 
 def _choose_magnification(longest: float, room: float, size: float) -> float:
-    """Return by which factor lengths [m] are drawn, of which the longest gets this room."""
-    return round_down(room / longest) if longest > SMALLEST * size else 1.0
-
-
-def round_down(value: float) -> float:
-    """Return 1, 2 or 5 times a power of ten, at most a value above zero."""
-    power = 10.0 ** math.floor(math.log10(value))
-    return power * max(step for step in (1.0, 2.0, 5.0) if step * power <= value)
+    """Return by which factor lengths [m] are drawn, of which the longest gets this room: 1, 2 or 5
+    times a power of ten.
+    """
+    if longest <= SMALLEST * size:
+        return 1.0
+    power = 10.0 ** math.floor(math.log10(room / longest))
+    return power * max(step for step in (1.0, 2.0, 5.0) if step * power <= room / longest)
 
 
 # The parts of a robot as points and lines in the base frame: limbs, joints, rods, platform, tool.

@@ -6,7 +6,7 @@ effects and method; a process prepares them once.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -135,17 +135,11 @@ def make_instrument(level: InstrumentLevel, noise: NoiseLevel) -> Instrument:
 
     Raises DataError: as `build_instrument`, or an unused column that it does not measure.
     """
-    instrument = build_instrument(
-        InstrumentDescription(
-            kinds=level.kinds,
-            components=level.components,
-            orientation=level.orientation,
-            sigma_position=noise.factor * level.sigma_position,
-            sigma_angle=noise.factor * level.sigma_angle,
-            unknown_frames=level.unknown_frames,
-            distribution=level.distribution,
-        )
-    )
+    names = {item.name for item in fields(InstrumentDescription)} & vars(level).keys()
+    described = {name: getattr(level, name) for name in names}
+    for name in ("sigma_position", "sigma_angle"):
+        described[name] *= noise.factor
+    instrument = build_instrument(InstrumentDescription(**described))
     known = [column.name for sensor in instrument.sensors for column in sensor.kind.columns]
     for name in level.unused:
         if name not in known:
