@@ -45,8 +45,6 @@ def width() -> int:
 class Output:
     """What a command has found out.
 
-    Attributes
-    ----------
     document : for --json. page : makes the paragraphs and tables for people, or text as it is;
         nothing is printed where they are empty.
     failures : quality gates that are not met. shown : whether the page contains them; then a
@@ -83,8 +81,6 @@ def print_output(output: Output, as_json: bool) -> int:
 def print_text(text: str) -> None:
     """Print text on standard output, plain and otherwise as it is.
 
-    Raises
-    ------
     FileError : standard output cannot be written, such as a file on a full disk.
     BrokenPipeError : its reader has stopped.
     """

@@ -421,8 +421,6 @@ class Question(Limited):
 class LevelChain:
     """Levels of a factor that differ in numbers only, which increase together.
 
-    Attributes
-    ----------
     label : what distinguishes these levels from those of other chains, such as "choice planned";
         empty where there is only one chain. quantity : name of the number, such as "count"; empty
         for a single level.
