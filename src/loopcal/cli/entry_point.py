@@ -48,8 +48,8 @@ SECTIONS = {
         "gcode": ("exchange", "Write a program that moves a machine to the poses of a plan."),
         "measure": ("session", "Measure the poses of a plan with a companion."),
         "fill": ("exchange", "Fill in the sheet of a plan from the export of an instrument."),
-        "board": ("picture", "Draw a board to print, for pictures by a phone or camera."),
-        "photos": ("picture", "Find the corners of a printed board in pictures."),
+        "board": ("measurement", "Draw a board to print, for pictures by a phone or camera."),
+        "photos": ("measurement", "Find the corners of a printed board in pictures."),
         "simulate": ("measurement", "Write a measurement file of a simulated machine."),
     },
     "Calibrate": {
@@ -82,8 +82,8 @@ SECTIONS = {
         "study": ("study", "Compare instruments, numbers of poses and methods by simulation.")
     },
     "Published studies": {
-        "reproduce": ("paper", "Repeat a published study and compare its numbers."),
-        "per-leg": ("paper", "Identify a hexapod leg by leg, to compare with calibrate."),
+        "reproduce": ("study", "Repeat a published study and compare its numbers."),
+        "per-leg": ("study", "Identify a hexapod leg by leg, to compare with calibrate."),
     },
     "Begin": {
         "example": ("robot", "Write the files of an example, to try the commands with."),
