@@ -23,7 +23,7 @@ from loopcal.errors import FileError, LoopcalError
 from loopcal.estimate.posterior import posterior_from_arrays
 from loopcal.estimate.result import residuals_from_arrays
 from loopcal.findings import report_finding
-from loopcal.io.core.outputs import refuse_outputs, restore_on_failure
+from loopcal.io.core.outputs import refuse_outputs, write_files
 from loopcal.io.core.text_file import as_path, to_json, write_bytes, write_text
 from loopcal.io.formats import FORMATS
 from loopcal.io.formats.import_export import build_source, export_robot
@@ -143,9 +143,7 @@ def save_report(
     refuse_outputs((path, data), (), force=True)
     document = build_calibration_document(load_record(report, facts))
     html, json_text = render_html(document), to_json({"format": 1, **json_fields(document)})
-    with restore_on_failure((path, data)):
-        write_text(path, html)
-        write_text(data, json_text)
+    write_files({path: html, data: json_text})
     return path
 
 

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from loopcal.errors import LoopcalError
+from loopcal.io.core.outputs import write_files
 from loopcal.io.robot.robot_file import find_robot_file
 from loopcal.measure.instrument import Uniform
 from loopcal.mechanism.kinematics import forward_trials
@@ -666,7 +667,7 @@ def test_the_study_of_another_robot_is_the_one_that_is_written(tripod_file, tmp_
     theta = np.rad2deg(design.poses[:, design.robot.controlled.index("theta")])
     np.testing.assert_allclose(np.unique(np.round(theta, 9)), [8.0, 16.0, 24.0])
     path = tmp_path / "study.yaml"
-    make_paper_study(PAPERS["tsvd-2016"], path, str(tripod_file)).write()
+    write_files(make_paper_study(PAPERS["tsvd-2016"], path, str(tripod_file)))
     study = load_study(path)
     keeps = [level.keep for level in study.methods.values() if level.keep is not None]
     assert keeps == list(range(len(design.free) - 1, 0, -1))

@@ -139,7 +139,7 @@ class Paper:
             return load_study(Path(str(files(self.package) / STUDY)))
         path = find_robot_file(robot).parent / STUDY  # is not written
         made = make_paper_study(self, path, robot)
-        return parse_study(parse_yaml(made.files[path], path, "study file"))
+        return parse_study(parse_yaml(made[path], path, "study file"))
 
     def read_file(self, name: str) -> str:
         """Return the text of a file of the paper."""
@@ -269,33 +269,10 @@ def find_paper(name: str) -> Paper:
     return PAPERS[name]
 
 
-@dataclass(frozen=True)
-class PaperStudyFile:
-    """A study file to write.
-
-    files : path -> text, of the study file and, beside it, of its poses. robot : that it names.
+def make_paper_study(paper: Paper, path: Path, robot: str | None = None) -> dict[Path, str]:
+    """Return the study file of a paper, for its robot or for another one (see `adapt_content`), and
+    the file of its poses beside it, as path -> text.
     """
-
-    files: Mapping[Path, str]
-    robot: str
-
-    @property
-    def outputs(self) -> tuple[Path, ...]:
-        """Files that are written."""
-        return tuple(self.files)
-
-    def write(self) -> None:
-        """Write the files; FileError where that is impossible."""
-        from loopcal.io.core.outputs import restore_on_failure
-        from loopcal.io.core.text_file import write_text
-
-        with restore_on_failure(self.outputs):
-            for path in reversed(self.outputs):
-                write_text(path, self.files[path])
-
-
-def make_paper_study(paper: Paper, path: Path, robot: str | None = None) -> PaperStudyFile:
-    """Return the study file of a paper, for its robot or for another one, see `adapt_content`."""
     from loopcal.io.core.yaml_file import format_yaml, parse_yaml, quote_scalar
     from loopcal.studies.files.study_file import name_robot
 
@@ -306,15 +283,15 @@ def make_paper_study(paper: Paper, path: Path, robot: str | None = None) -> Pape
     table = paper.read_file(file) if file else ""
     if wanted == paper.robots[0]:
         if not file:
-            return PaperStudyFile({path: text}, wanted)
+            return {path: text}
         beside = path.with_name(f"{path.stem}-poses.csv")
         text = text.replace(f"{{file: {file}}}", f"{{file: {quote_scalar(beside.name)}}}")
-        return PaperStudyFile({path: text, beside: table}, wanted)
+        return {path: text, beside: table}
     other = load_robot(wanted)
     content |= {"title": f"{paper.name} with {other.name}", "robots": [name_robot(path, wanted)]}
     content |= adapt_content(content, other, max(len(table.splitlines()) - 1, 0))
     head = text[: text.index("format:")]
-    return PaperStudyFile({path: head + format_yaml(content)}, wanted)
+    return {path: head + format_yaml(content)}
 
 
 def adapt_content(content: Mapping[str, Any], robot: Mechanism, listed: int) -> dict[str, Any]:

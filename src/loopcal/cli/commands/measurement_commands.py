@@ -495,8 +495,7 @@ def board(
       loopcal board -o board.yaml --columns 12 --rows 8 --square 15mm --paper letter
     """
     from loopcal.errors import DataError
-    from loopcal.io.core.outputs import refuse_outputs, restore_on_failure
-    from loopcal.io.core.text_file import write_bytes, write_text
+    from loopcal.io.core.outputs import refuse_outputs, write_files
     from loopcal.io.pictures import (
         PAPERS,
         choose_board,
@@ -512,10 +511,8 @@ def board(
     refuse_outputs(files, (), force)
     chosen, sheet = choose_board(columns, rows, square), PAPERS[paper]
     shapes, words = draw_board(chosen, sheet)
-    with restore_on_failure(files):
-        write_text(files[0], format_board(chosen))
-        write_text(files[1], format_svg(shapes, words, sheet))
-        write_bytes(files[2], format_pdf(shapes, words, sheet))
+    drawn = format_svg(shapes, words, sheet), format_pdf(shapes, words, sheet)
+    write_files(dict(zip(files, (format_board(chosen), *drawn), strict=True)))
     document = {
         "board": files[0],
         "drawings": files[1:],
@@ -583,8 +580,7 @@ def photos(
     from loopcal.findings import report_finding
     from loopcal.io import pictures as of
     from loopcal.io.core.csv_table import refuse_settings_beside
-    from loopcal.io.core.outputs import refuse_outputs, restore_on_failure
-    from loopcal.io.core.text_file import write_text
+    from loopcal.io.core.outputs import refuse_outputs, write_files
     from loopcal.io.pictures import load_dictionary, read_board
     from loopcal.studies.executors import Processes, Serial
 
@@ -615,9 +611,7 @@ def photos(
     settings: dict[str, Any] = {"noise": dict.fromkeys("uv", f"{sigma:g} px")}
     settings |= {"noise_source": "assumed", "mount": mount, **beside}
     text = of.format_pictures(known, pictures, names, settings)
-    with restore_on_failure((output, page_file)):
-        write_text(output, text)
-        write_text(page_file, of.format_contact_sheet(pictures, names))
+    write_files({output: text, page_file: of.format_contact_sheet(pictures, names)})
     used = [picture for picture in pictures if picture.fault is None]
     shown = [
         {"picture": p.path, "pose": names[p.path], "corners": len(p.corners)}

@@ -56,8 +56,8 @@ def new(
     """
     from loopcal.io.core.csv_table import refuse_settings_beside
     from loopcal.io.core.limits import make_name
-    from loopcal.io.core.outputs import refuse_outputs, restore_on_failure
-    from loopcal.io.core.text_file import to_json, write_text
+    from loopcal.io.core.outputs import refuse_outputs, write_files
+    from loopcal.io.core.text_file import to_json
     from loopcal.io.core.yaml_file import parse_yaml
     from loopcal.io.data.measurement_file import format_template
     from loopcal.io.robot.robot_file import EDITOR_SCHEMA, build_robot, format_new_robot
@@ -89,9 +89,7 @@ def new(
         texts[report_facts] = read_template()
         page.append(f"{report_facts}: facts for reports and certificates. Fill in what you know.")
         page.append(suggest_command("report", "run", "--facts", report_facts, "--pdf"))
-    with restore_on_failure(tuple(texts)):
-        for path, text in texts.items():
-            write_text(path, text)
+    write_files(texts)
     written = {"robot": output, "measurements": measurements, "report_facts": report_facts}
     return Output(written, lambda: page)
 

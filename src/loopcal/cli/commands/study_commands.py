@@ -156,7 +156,7 @@ def new(
       loopcal study new study.yaml --robot hexapod-42
       loopcal study new study.yaml --paper cmm-constraint-2011 --robot hexapod-42
     """
-    from loopcal.io.core.outputs import refuse_outputs
+    from loopcal.io.core.outputs import refuse_outputs, write_files
     from loopcal.studies.files.study_file import write_template
 
     following = suggest_command("study", "check", study_file)
@@ -166,14 +166,12 @@ def new(
         chosen = find_paper(paper)
         replaced = chosen.make_case(robot).list_replaced()  # refuses a robot that does not fit
         made = make_paper_study(chosen, study_file, robot)
-        refuse_outputs(made.outputs, (), force)
-        made.write()
-        written = [str(path) for path in made.outputs]
+        refuse_outputs(tuple(made), (), force)
+        write_files(made)
+        written = [*map(str, made)]
         page = [f"Written: {', '.join(written)}", *replaced, following]
-        return Output(
-            {"written": written, "paper": paper, "robot": made.robot, "replaced": replaced},
-            lambda: page,
-        )
+        document = {"written": written, "paper": paper, "robot": robot or chosen.robots[0]}
+        return Output(document | {"replaced": replaced}, lambda: page)
     robot = "linear-delta" if robot is None else robot
     refuse_outputs((study_file,), (), force)
     write_template(study_file, robot)

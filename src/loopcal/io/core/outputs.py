@@ -35,6 +35,7 @@ from loopcal.io.core.text_file import (
     restore_files,
     sha256,
     watch_folder,
+    write_bytes,
 )
 
 FILES = "files"
@@ -82,6 +83,13 @@ def restore_on_failure(outputs: Sequence[Path | None]) -> Iterator[None]:
     """Restore or remove these files where the body fails; None is skipped."""
     with restore_files([resolve_target(path) for path in outputs if path is not None]):
         yield
+
+
+def write_files(files: Mapping[Path, str] | Mapping[Path, str | bytes]) -> None:
+    """Write files (path -> content) whole, or none of them; FileError where that is impossible."""
+    with restore_on_failure(tuple(files)):
+        for path, content in files.items():
+            write_bytes(path, content.encode("utf-8") if isinstance(content, str) else content)
 
 
 def _is_same_file(path: Path, other: Path) -> bool:

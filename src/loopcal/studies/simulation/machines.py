@@ -135,7 +135,7 @@ def make_instrument(level: InstrumentLevel, noise: NoiseLevel) -> Instrument:
 
     Raises DataError: as `build_instrument`, or an unused column that it does not measure.
     """
-    names = {item.name for item in fields(InstrumentDescription)} & vars(level).keys()
+    names = [item.name for item in fields(InstrumentDescription) if hasattr(level, item.name)]
     described = {name: getattr(level, name) for name in names}
     for name in ("sigma_position", "sigma_angle"):
         described[name] *= noise.factor
