@@ -168,16 +168,16 @@ def test_what_a_run_lacks_is_stated_in_one_sentence(run) -> None:
         residuals=(),
     )
     text = re.sub(r"\s+", " ", render_html(build_calibration_document(lacking)))
-    for sentence in (
-        "No pose was held out of this fit",
-        "does not contain the labels of its residuals",
-        "lacks the readings of its poses",
-        "the accuracy over the workspace is unknown",
-        "there is no uncertainty budget",
-        "does not name its fitted poses",
-        "This run held out no pose.",
+    for name in (
+        "errors.not-held-out",
+        "residual-figure.not-stored",
+        "scene-figure.no-readings",
+        "accuracy-figure.unknown",
+        "budget.none",
+        "poses.unknown",
+        "poses.none",
     ):
-        assert sentence in text, sentence
+        assert say(name) in text, name
 
 
 def test_failed_fit_has_no_values_for_a_machine(run) -> None:
@@ -215,9 +215,9 @@ def test_many_rows_are_thinned_and_the_report_says_so(run) -> None:
     text = render_html(build(lengthened, "residuals", "poses", "workspace"))
     assert "The figure shows 3,000 of 120,000 fitted poses." in text
     assert "The 3-D view can show the robot at 1,025 of these poses, evenly spread." in text
-    assert "than every measured pose of the 3,000 that are compared." in text
+    assert "than every measured pose of 3,000, evenly spread." in text
     assert "The figure shows 3,000 of 120,000 rows." in text
-    assert "120,000 fitted poses, of which the first 3,000 are listed" in text
+    assert "120,000 fitted poses, here the first 3,000" in text
     assert len(text) < 5e6
     assert thin_rows(rows, len(rows.raw)) is rows
 
@@ -244,13 +244,13 @@ def test_report_of_a_cable_robot_names_its_repeatability_and_judges_no_sigma_by_
     text = render_html(build(record, "verdict", "residuals"))
     assert "Calibration cannot reduce it" in text
     assert "better instrument" not in text
-    assert "every pose is estimated too" in text
+    assert say("residual-figure.description", has_readings=True) in text
 
 
 def test_report_explains_the_stated_frame_and_small_residuals(page) -> None:
     text = page.read_text("utf-8")
-    assert "The stated frame is the one in which the measurement files state" in text
-    assert "every pose is estimated too" not in text
+    assert say("errors.baseline", is_stated_frame=True) in text
+    assert say("residual-figure.description", has_readings=False) in text
 
 
 def test_orientations_have_one_unit_and_coverage_factors_two_places(page) -> None:
