@@ -748,7 +748,7 @@ def _draw_table_3(results: Results) -> published.Figure:
 
 def judge_claims(results: Results) -> tuple[published.Verdict, ...]:
     """Return a verdict for each claim."""
-    groups = [_judge_equations, _judge_table_3, _judge_experiment]
+    groups = [_judge_equations, _judge_table_3, _judge_experiment, _judge_prior]
     study, cell = results.study, results.figure_5
     judge = partial(TEXT.judge, elsewhere=results.is_elsewhere, count=len(results.cells),
                     parameters=len(study.planned.free), trials=results.trials, noise=cell.noise,
@@ -779,7 +779,7 @@ def _judge_equations(results: Results, judge: Judge) -> Iterator[published.Verdi
 
 
 def _judge_table_3(results: Results, judge: Judge) -> Iterator[published.Verdict]:
-    """Judge least squares and the prior on the machines of Table 3."""
+    """Judge least squares on the machines of Table 3."""
     from scipy.stats import beta
 
     study, cells, cell = results.study, results.cells, results.figure_5
@@ -832,23 +832,6 @@ def _judge_table_3(results: Results, judge: Judge) -> Iterator[published.Verdict
                 position=results.word_reduction(name_measure("position", ABSOLUTE)),
                 aligned=results.word_reduction(POSITION))  # fmt: skip
 
-    def judge_prior(cell: Cell) -> list[bool | None]:
-        before, ls, prior = (cell.errors[m][POSITION] for m in (BEFORE, LS, PRIOR))
-        is_good = (prior <= (1.0 + sure) * ls) & (prior <= before)
-        return decide_each(is_good, cell.converged[LS] & cell.converged[PRIOR])
-
-    sure, hardest = SIZES.find("sure"), max(cells, key=lambda k: cells[k].ratio)
-    priors = [decide_share(results.pool(lambda draw, k=k: judge_prior(draw.cells[k])))
-              for k in cells]  # fmt: skip
-    lost = published.estimate_share(results.pool(
-        lambda draw: [x > 1.0 for x in draw.cells[hardest].compute_left(PRIOR, POSITION)]
-    ))  # fmt: skip
-    yield judge("prior", decide(all(d is True for d in priors), False in priors), sure=100 * sure,
-                better=priors.count(True), worse=priors.count(False), share=100.0 * lost.value,
-                errors=study.describe_errors(hardest[0]), noise=hardest[1],
-                left={m: cells[hardest].compute_median(m, POSITION)
-                      for m in (BEFORE, LS, PRIOR)})  # fmt: skip
-
 
 def _judge_experiment(results: Results, judge: Judge) -> Iterator[published.Verdict]:
     """Judge iterations, time and full poses of the points of the experiment."""
@@ -883,3 +866,25 @@ def _judge_experiment(results: Results, judge: Judge) -> Iterator[published.Verd
                 ratio=limit / longest)  # fmt: skip
     yield judge("full_poses", decide_all(falling), falling=falling.count(True),
                 rising=falling.count(False), ways=len(falling), **changes)  # fmt: skip
+
+
+def _judge_prior(results: Results, judge: Judge) -> Iterator[published.Verdict]:
+    """Judge the prior on the machines of Table 3."""
+    study, cells = results.study, results.cells
+
+    def judge_prior(cell: Cell) -> list[bool | None]:
+        before, ls, prior = (cell.errors[m][POSITION] for m in (BEFORE, LS, PRIOR))
+        is_good = (prior <= (1.0 + sure) * ls) & (prior <= before)
+        return decide_each(is_good, cell.converged[LS] & cell.converged[PRIOR])
+
+    sure, hardest = SIZES.find("sure"), max(cells, key=lambda k: cells[k].ratio)
+    priors = [decide_share(results.pool(lambda draw, k=k: judge_prior(draw.cells[k])))
+              for k in cells]  # fmt: skip
+    lost = published.estimate_share(results.pool(
+        lambda draw: [x > 1.0 for x in draw.cells[hardest].compute_left(PRIOR, POSITION)]
+    ))  # fmt: skip
+    yield judge("prior", decide(all(d is True for d in priors), False in priors), sure=100 * sure,
+                better=priors.count(True), worse=priors.count(False), share=100.0 * lost.value,
+                errors=study.describe_errors(hardest[0]), noise=hardest[1],
+                left={m: cells[hardest].compute_median(m, POSITION)
+                      for m in (BEFORE, LS, PRIOR)})  # fmt: skip
