@@ -89,22 +89,33 @@ class TextColumn(Column):
 
 @dataclass(frozen=True)
 class NumberColumn(Column):
-    """A column of numbers of a dimension, written in the unit `symbol`; `inf` where it
-    `allows_infinity`, for a reading that is not trusted.
+    """A column of numbers, written in the product of the units `symbols`: none for counts, such as
+    corners of a board, and two for covariances, as `[mm*mrad]`; `inf` where it `allows_infinity`,
+    for a reading that is not trusted.
     """
 
-    dimension: Dimension
-    symbol: str
+    symbols: tuple[str, ...]
     allows_infinity: bool = False
 
     @property
     def header(self) -> str:
-        """Name and unit."""
-        return f"{self.name} [{self.symbol}]"
+        """Name, and unit where there is one."""
+        return f"{self.name} [{'*'.join(self.symbols)}]" if self.symbols else self.name
 
     def parse(self, table: Table) -> FloatArray:
-        """Return the values [SI], NaN where a cell is empty."""
-        return table.numbers(self.name, self.dimension, infinite=self.allows_infinity)
+        """Return the values [SI], NaN where a cell is empty, which that of a covariance is not."""
+        dimensions, stated = [find_unit(s).dimension for s in self.symbols], table.units[self.name]
+        if not dimensions and stated is not None:
+            raise table.header_error(f"column {self.name!r} has a unit. Remove it: it only counts")
+        if len(dimensions) == 1:
+            return table.numbers(self.name, dimensions[0], infinite=self.allows_infinity)
+        symbols = stated.split("*") if stated else []
+        if len(symbols) != len(dimensions):
+            sentence = f"column {self.name!r} needs two units, as in '{self.name} [mm*mrad]'"
+            raise table.header_error(sentence)
+        units = map(table.unit, [self.name] * len(symbols), dimensions, map(str.strip, symbols))
+        factor = math.prod(unit.factor_to_si for unit in units)
+        return table.scaled_numbers(self.name, 1.0, empty=not dimensions) * factor
 
     def format(self, value: Any) -> str:
         """Return a number [SI] in the unit; nothing for NaN."""
@@ -113,56 +124,11 @@ class NumberColumn(Column):
             return ""
         if math.isinf(number):
             return "inf"
-        return format_exact(number, find_unit(self.symbol).factor_to_si)
-
-
-@dataclass(frozen=True)
-class CountColumn(Column):
-    """A column of whole numbers, such as the corner of a board, without a unit."""
-
-    def parse(self, table: Table) -> FloatArray:
-        """Return the numbers, NaN where a cell is empty."""
-        if table.units[self.name] is not None:
-            raise table.header_error(f"column {self.name!r} has a unit. Remove it: it only counts")
-        return table.scaled_numbers(self.name, 1.0)
-
-    def format(self, value: Any) -> str:
-        """Return the number; nothing for NaN."""
-        return "" if math.isnan(float(value)) else f"{float(value):g}"
-
-
-@dataclass(frozen=True)
-class ProductColumn(Column):
-    """A column of covariances, whose unit is a product such as `[mm*mrad]`."""
-
-    dimensions: tuple[Dimension, Dimension]
-
-    @property
-    def symbols(self) -> tuple[str, ...]:
-        """Units of the two factors as they are written."""
-        return tuple(DISPLAY_UNITS[d].symbol for d in self.dimensions)
-
-    @property
-    def header(self) -> str:
-        """Name and unit."""
-        return f"{self.name} [{'*'.join(self.symbols)}]"
-
-    def parse(self, table: Table) -> FloatArray:
-        """Return the values [SI]; every row needs one."""
-        symbols = (table.units[self.name] or "").split("*")
-        if len(symbols) != 2:
-            sentence = f"column {self.name!r} needs two units, as in '{self.name} [mm*mrad]'"
-            raise table.header_error(sentence)
-        a, b = (
-            table.unit(self.name, dimension, symbol.strip()).factor_to_si
-            for symbol, dimension in zip(symbols, self.dimensions, strict=True)
-        )
-        return table.scaled_numbers(self.name, 1.0, empty=False) * (a * b)
-
-    def format(self, value: Any) -> str:
-        """Return a covariance [SI] in the unit."""
+        if not self.symbols:
+            return f"{number:g}"
         factor = math.prod(find_unit(symbol).factor_to_si for symbol in self.symbols)
-        return format_scaled(float(value), factor)
+        write = format_exact if len(self.symbols) == 1 else format_scaled
+        return write(number, factor)
 
 
 @dataclass(frozen=True)
@@ -285,10 +251,9 @@ class ColumnRule(NamedTuple):
     match: Callable[[str], Column | None] = lambda _: None
 
 
-def _number(name: str, dimension: Dimension) -> Column:
-    if dimension is Dimension.COUNT:
-        return CountColumn(name)
-    return NumberColumn(name, dimension, DISPLAY_UNITS[dimension].symbol)
+def _number(name: str, *dimensions: Dimension) -> NumberColumn:
+    of_unit = [dimension for dimension in dimensions if dimension is not Dimension.COUNT]
+    return NumberColumn(name, tuple(DISPLAY_UNITS[dimension].symbol for dimension in of_unit))
 
 
 def _text_rule(meaning: str, column: TextColumn) -> ColumnRule:
@@ -323,7 +288,7 @@ RULES: tuple[ColumnRule, ...] = (
         lambda robot, _: [
             ContextColumn(a.name)
             if is_context(a.name)
-            else NumberColumn(a.name, a.dimension, robot.units[a.dimension])
+            else NumberColumn(a.name, (robot.units[a.dimension],))
             for a in robot.actuators
         ],
     ),
@@ -359,7 +324,7 @@ RULES: tuple[ColumnRule, ...] = (
         "untrusted reading",
         lambda robot, kinds: [
             *(
-                NumberColumn(SIGMA + a.name, a.dimension, robot.units[a.dimension], True)
+                NumberColumn(SIGMA + a.name, (robot.units[a.dimension],), True)
                 for a in robot.actuators
             ),
             *(
@@ -374,7 +339,7 @@ RULES: tuple[ColumnRule, ...] = (
         "[mm*mrad]",
         "covariance of two measured values in this row",
         lambda robot, kinds: [
-            ProductColumn(name_covariance(a.name, b.name, robot), (a.dimension, b.dimension))
+            _number(name_covariance(a.name, b.name, robot), a.dimension, b.dimension)
             for kind in kinds
             for a, b in permutations(kind.noise_columns, 2)
         ],
