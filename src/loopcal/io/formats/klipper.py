@@ -30,7 +30,7 @@ from typing import Any
 
 import numpy as np
 
-from loopcal.errors import FileError
+from loopcal.errors import DataError, FileError
 from loopcal.findings import Quantity, report_finding
 from loopcal.io.core.csv_table import parse_finite
 from loopcal.io.core.yaml_file import format_yaml
@@ -222,6 +222,7 @@ def parse_geometry(cfg: KlipperConfig) -> DeltaGeometry:
 
 ROTARY_ANGLES = (30.0, 150.0, 270.0)
 """Angles of the motors of a rotary delta by default [deg]."""
+SHOULDER = ("shoulder_radius", "shoulder_height")
 ROTARY_PARTS = ("{}.offset", "angle_{}.offset", "arm_{}.tip.x", "arm_{}.length")
 """Parameters of an arm, by its letter: end stop, angle of the motor, upper and lower arm."""
 
@@ -232,7 +233,7 @@ def format_rotary(
     """Return the robot file of a rotary delta. Free is what Klipper's own calibration adjusts, and
     the arms if the options state how accurately they were measured.
     """
-    radius, height = (cfg.positive("printer", f"shoulder_{name}") for name in ("radius", "height"))
+    radius, height = (cfg.positive("printer", name) for name in SHOULDER)
     arms = [cfg.positive(STEPPERS[0], f"{part}_arm_length") for part in ("upper", "lower")]
     first = (*arms, cfg.number(STEPPERS[0], "position_endstop"))
     tolerance: dict[str, Any] = {}
@@ -246,7 +247,7 @@ def format_rotary(
         upper, lower, stop = map(cfg.number, [section] * 3, names, first)
         at_stop, at_bed = (-_raise_arm(radius, z - height, upper, lower) for z in (stop, 0.0))
         if not math.isfinite(at_stop + at_bed):
-            found = report_finding("files.arms-out-of-reach", section=section, stop=stop)
+            found = report_finding("files.arms-out-of-reach", section=section)
             raise cfg.error(found, section, "position_endstop")
         drives[k] = {"reads": "angle", "offset": at_stop, "unknown": ["offset"]}
         turn = {"sum": {f"arm_{k}.angle": 1}, "offset": angle, "unknown": ["offset"]}
@@ -264,17 +265,13 @@ def format_rotary(
     content |= {"limbs": limbs, "fixed": fixed, "home": {"z": 0}}
     content["parameters"] = [
         {"name": name, "length": value, "maps": [{**place, "axis": axis} for place in places]}
-        for name, value, axis in (
-            ("shoulder_radius", radius, "x"),
-            ("shoulder_height", height, "z"),
-        )
+        for name, value, axis in zip(SHOULDER, (radius, height), "xz", strict=True)
     ]
     content["workspace"] = {"x": [-half, half], "y": [-half, half], "z": [0, half]}
     what = "a printer.cfg of Klipper, kinematics rotary_delta"
     remark = "Readings are the angles of the arms below their end stops."
-    return format_head(path, what, "limbs", options.name, ("mm", "deg"), remark) + format_yaml(
-        content
-    )
+    head = format_head(path, what, "limbs", options.name, ("mm", "deg"), remark)
+    return head + format_yaml(content)
 
 
 def _raise_arm(radius: float, depth: float, upper: float, lower: float) -> float:
@@ -294,12 +291,14 @@ def _list_rotary(source: ExportSource) -> dict[Name, float | str]:
     def show(number: float, name: str, factor: float = MM) -> float:
         return source.round_number(number / factor, name, factor, DECIMALS)
 
-    for name in ("shoulder_radius", "shoulder_height"):
+    for name in SHOULDER:
         wanted["printer", name] = show(values[name], name)
     for section in STEPPERS:
         names = [part.format(section[-1]) for part in ROTARY_PARTS]
         offset, angle, upper, lower = (values[name] for name in names)
         x = values["shoulder_radius"] + upper * math.cos(offset)
+        if lower < abs(x):
+            raise DataError(report_finding("files.arms-out-of-reach", section=section))
         z = values["shoulder_height"] - upper * math.sin(offset) - math.sqrt(lower**2 - x**2)
         wanted[section, "angle"] = show(angle, names[1], math.radians(1))
         wanted[section, "upper_arm_length"] = show(upper, names[2])

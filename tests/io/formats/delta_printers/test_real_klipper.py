@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import loopcal as lc
-from loopcal.errors import FileError
+from loopcal.errors import DataError, FileError
 from loopcal.io.formats import FORMATS
 from loopcal.io.formats.import_export import build_imported_robot
 from loopcal.io.formats.program_format import ExportSource, ImportOptions
@@ -271,6 +271,11 @@ def test_arms_that_do_not_reach_are_refused_with_their_line(tmp_path) -> None:
         read(path)
     assert refused.value.code == "files.arms-out-of-reach"
     assert refused.value.line is not None
+    path.write_text(ROTARY)
+    robot = read(path)[0]
+    short = np.where([n.endswith(".length") for n in robot.parameters.names], 0.1, robot.values)
+    with pytest.raises(DataError):
+        FORMATS["klipper"].write(ExportSource(robot.with_values(short)), None)  # type: ignore[misc]
 
 
 def intersect(centers: np.ndarray, lengths: np.ndarray) -> np.ndarray:
