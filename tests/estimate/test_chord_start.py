@@ -123,5 +123,5 @@ def test_fits_of_fewer_rows_than_parameters_are_the_usual_ones():
 
 def test_no_trials_are_refused():
     trials = simulate(HEXAPOD, 1, 12)
-    with pytest.raises(EstimationError, match="no trials"):
+    with pytest.raises(EstimationError, match="set of trials is empty"):
         identify_trials(HEXAPOD, replace(trials, truth=trials.truth[:0]))
