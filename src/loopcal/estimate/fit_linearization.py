@@ -295,6 +295,8 @@ def fold_sources(
     folded: dict[tuple[int, int], SourceFactor] = {}
     for block, linearized in poses.iterate_poses(solution, z):
         kinds = poses.linearize_kinds(block, linearized, problem.trials, fixed)
+        tree = None if poses.nuisance is None else poses.nuisance.tree
+        parts = divide_among_nodes(kinds, block.members, tree)
         for source in range(count):
             own = [
                 _take_share(find_share(of, source, numbers), len(numbers), len(rows.poses))
@@ -302,7 +304,7 @@ def fold_sources(
             ]
             if not any(rows.any() for rows in own):
                 continue
-            node_rows = _select_rows(poses, block, kinds, own)
+            node_rows = _select_rows(poses, block, kinds, parts, own)
             for part in spread_rows(poses, block, node_rows, p, at_nodes):
                 rows = part.rows[..., :-1]
                 for factor in divide_by_cluster(source, part.unknowns, rows, p, estimate):
@@ -343,20 +345,31 @@ def _fold_together(first: SourceFactor | None, other: SourceFactor) -> SourceFac
 
 
 def _select_rows(
-    poses: PoseRows, block: PoseBlock, kinds: Sequence[KindRows | None], own: Sequence[FloatArray]
+    poses: PoseRows,
+    block: PoseBlock,
+    kinds: Sequence[KindRows | None],
+    parts: Sequence[NodeRows],
+    own: Sequence[FloatArray],
 ) -> list[NodeRows]:
-    """Return the rows of one source, with roots `own` (r, ..) of every kind, projected along all
-    rows of poses that have coordinates.
+    """Return the rows of one source, with roots `own` (r, ..) of every kind, of nodes in `parts`,
+    or projected along all rows of poses that have coordinates.
     """
-    tree = None if poses.nuisance is None else poses.nuisance.tree
-    chosen = []
-    masked = [kind and _weigh(kind, roots) for kind, roots in zip(kinds, own, strict=True)]
-    for part in divide_among_nodes(masked, block.members, tree):
-        kept = np.any(own[part.kind], axis=(1, 2))[part.numbers]
-        nodes, numbers, rows = part.nodes[kept], part.numbers[kept], part.rows[:, kept]
+    tree, chosen = None if poses.nuisance is None else poses.nuisance.tree, []
+    for part in parts:
+        root = own[part.kind][part.numbers]
+        kept = np.any(root, axis=(1, 2))
         if kept.any():
+            nodes, numbers = part.nodes[kept], part.numbers[kept]
+            rows = _weigh(part.rows[:, kept], root[kept])
             chosen.append(part._replace(nodes=nodes, numbers=numbers, rows=rows))
     k = poses.coordinates.count
+    masked = [
+        kind
+        and KindRows(
+            _weigh(kind[0], root), *(a if a is None else _weigh(a, root) for a in kind[1:])
+        )
+        for kind, root in zip(kinds, own if block.groups else (), strict=False)
+    ]
     for group in block.groups:
         all_rows, own_rows = (stack_rows(block, group, rows, k, tree) for rows in (kinds, masked))
         width = group.poses.shape[1] * k
@@ -375,16 +388,7 @@ def _take_share(share: FloatArray, count: int, divided: int) -> FloatArray:
     return np.broadcast_to(share, (count, k, *share.shape[2:])).reshape(divided, *share.shape[2:])
 
 
-def _weigh(kind: KindRows, root: FloatArray) -> KindRows:
-    """Return the rows of a kind times roots (r, m, m) or numbers (r, 1, 1)."""
-
-    def weigh(array: FloatArray) -> FloatArray:
-        of_rows = root.reshape(len(root), *[1] * (array.ndim - 4), *root.shape[1:])
-        return array * of_rows if root.shape[1] == 1 else of_rows @ array
-
-    by_nuisance, by_coordinates = kind.by_nuisance, kind.by_coordinates
-    return KindRows(
-        weigh(kind.machine),
-        None if by_nuisance is None else weigh(by_nuisance),
-        None if by_coordinates is None else weigh(by_coordinates),
-    )
+def _weigh(rows: FloatArray, root: FloatArray) -> FloatArray:
+    """Return rows (a, r, .., m, c) times roots (r, m, m) or numbers (r, 1, 1)."""
+    of_rows = root.reshape(len(root), *[1] * (rows.ndim - 4), *root.shape[1:])
+    return rows * of_rows if root.shape[1] == 1 else of_rows @ rows
