@@ -10,7 +10,6 @@ import pytest
 from numpy.testing import assert_allclose
 
 import loopcal.estimate.pose_rows as blocks_module
-from loopcal.estimate.elimination import fold_components
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.identification import identify
 from loopcal.estimate.information import observe_poses, observe_rows
@@ -20,7 +19,13 @@ from loopcal.measure.instrument import Gaussian, Instrument, Sensor
 from loopcal.measure.kinds.surfaces import Plane
 from loopcal.measure.simulation import simulate
 from loopcal.numerics.decomposition import NUISANCE_TOLERANCE, NULL_COMPONENT
-from loopcal.numerics.elimination import EliminationTree, NodeFactors, build_tree, eliminate_tree
+from loopcal.numerics.elimination import (
+    EliminationTree,
+    NodeFactors,
+    build_tree,
+    eliminate_tree,
+    shorten_rows,
+)
 from tests import zoo
 from tests.estimate.problems import hexapod, hexapod_poses
 
@@ -346,7 +351,7 @@ def test_fit_of_planes_that_share_a_probe_converges():
     )  # of 42, less the frames of the base and of the tool: the probe and the planes are free
 
 
-def test_components_of_many_targets_are_folded_by_their_own_columns():
+def test_rows_of_many_targets_are_folded_by_their_own_columns():
     """The factor of the shorter rows is that of all rows; three components of each target use
     three columns of their own and six of the frame.
     """
@@ -359,12 +364,10 @@ def test_components_of_many_targets_are_folded_by_their_own_columns():
     for j in range(targets):
         own = slice(frame + 3 * j, frame + 3 * j + 3)
         rows[:, :, 3 * j : 3 * j + 3, own] = rng.standard_normal((1, k, 3, 3))
-    nodes = np.arange(k) % 2
-    short = fold_components(rows, width, nodes, 2)
-    assert short is not None
-    assert short.shape[1] < 0.6 * k * 3 * targets
-    for node, own in enumerate(np.split(short[0], 2)):
-        whole = rows[0, nodes == node].reshape(-1, width + p + 1)
-        assert_allclose(own.T @ own, whole.T @ whole, atol=1e-10)
+    flat = rows.reshape(1, -1, width + p + 1)
+    short = shorten_rows(flat, width)
+    assert short.shape[1] < 0.3 * k * 3 * targets
+    assert_allclose(short[0].T @ short[0], flat[0].T @ flat[0], atol=1e-10)
     few = np.concatenate([rows[:, :, :6, :12], rows[:, :, :6, width:]], axis=3)
-    assert fold_components(few, 12, nodes, 2) is None
+    few = few.reshape(1, -1, few.shape[3])
+    assert shorten_rows(few, 12) is few

@@ -52,6 +52,7 @@ from loopcal.numerics.elimination import (
     TreeElimination,
     build_tree,
     eliminate_tree,
+    spread_columns,
 )
 from loopcal.numerics.statistics import compute_chi_square_tail, find_distinct
 from loopcal.typing import BoolArray, FloatArray, IntArray
@@ -242,12 +243,9 @@ class Predictor(NamedTuple):
         """
         U = len(data.nuisance_parameters)
         for blocks, unknowns, columns, r in self._iterate_blocks(data, member):
-            c, m = unknowns.shape[1], columns.shape[1]
-            whole = np.zeros((len(blocks), m, U + 1 + columns.shape[2] - c))
-            places = np.broadcast_to(np.where(unknowns < 0, U, unknowns)[:, None], (*r.shape, c))
-            np.put_along_axis(whole, places, columns[..., :c], axis=2)
-            whole[..., U + 1 :] = columns[..., c:]
-            yield blocks, np.delete(whole, U, axis=2), r
+            moved, machine = np.split(columns, [unknowns.shape[1]], axis=2)
+            whole = spread_columns(moved, np.where(unknowns < 0, U, unknowns), U)
+            yield blocks, np.concatenate([whole, machine], axis=2), r
 
     def predict(self, data: Measurements) -> FloatArray:
         """Return the derivative (U + p + m, k) of nuisance parameters of data, free parameters and
@@ -332,13 +330,12 @@ def _divide(
     groups = []
     for s in find_distinct(structure).tolist():
         own = structure == s
-        columns, width = moved[own], 0 if s < 0 else tree.structures[s].width
-        spread = np.zeros((*rows[own].shape[:2], width + 1))
+        spread = rows[own][..., :0]
         if s >= 0:
-            places = np.where(columns >= 0, tree.columns(node[own], columns), width)
-            places = np.broadcast_to(places[:, None], rows[own].shape)
-            np.put_along_axis(spread, places, rows[own], axis=2)
-        both = np.concatenate([spread[..., :width], shared[own]], axis=2)
+            width = tree.structures[s].width
+            columns = np.where(moved[own] >= 0, tree.columns(node[own], moved[own]), width)
+            spread = spread_columns(rows[own], columns, width)
+        both = np.concatenate([spread, shared[own]], axis=2)
         groups.append(BlockRows(s, blocks[own], node[own], both, residual[own], present[own]))
     return groups
 

@@ -41,7 +41,6 @@ from loopcal.diagnose.intervals import (
 from loopcal.diagnose.outliers import TESTABLE
 from loopcal.diagnose.residual_patterns import order_by_time
 from loopcal.errors import EstimationError
-from loopcal.estimate.elimination import spread_columns
 from loopcal.estimate.fit_linearization import FitLinearization, linearize_fit
 from loopcal.estimate.linearization import linearize_rows
 from loopcal.estimate.observation_rows import linked_blocks
@@ -52,7 +51,7 @@ from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
 from loopcal.measure.measurements import Measurements
 from loopcal.numerics.decomposition import NUISANCE_TOLERANCE, are_nonzero
-from loopcal.numerics.elimination import find_connected_groups
+from loopcal.numerics.elimination import find_connected_groups, spread_columns
 from loopcal.numerics.statistics import compute_single_level
 from loopcal.results.description import Field, fields, label_axes
 from loopcal.results.result import TableResult

@@ -42,6 +42,7 @@ from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
 from loopcal.measure.measurements import Measurements
 from loopcal.numerics.decomposition import Decomposition
+from loopcal.numerics.elimination import spread_columns
 from loopcal.numerics.statistics import (
     choose_evenly,
     compute_chi_square_quantile,
@@ -209,10 +210,10 @@ def join_columns(unknowns: IntArray, moved: FloatArray) -> tuple[IntArray, Float
     place = np.empty_like(flat)
     np.put_along_axis(place, order, number, axis=1)
     c = int(number.max()) + 1
-    own, columns = np.full((b, c), -1), np.zeros((b, m, c))
+    own, columns = np.full((b, c), -1), place.reshape(b * m, w)
     np.put_along_axis(own, number, ordered, axis=1)
-    np.put_along_axis(columns, place.reshape(b, m, w), moved, axis=2)
-    return own, columns
+    wide = spread_columns(moved.reshape(b * m, 1, w), columns, c)
+    return own, wide.reshape(b, m, c)
 
 
 MOST_ROUNDS = 20  # largest number of searches with other suspects

@@ -28,6 +28,7 @@ from loopcal.numerics.elimination import (
     TreeElimination,
     build_tree,
     eliminate_tree,
+    spread_columns,
 )
 from loopcal.numerics.statistics import find_distinct
 from loopcal.numerics.trial_batch import TrialBatch
@@ -219,17 +220,6 @@ def divide_among_nodes(
                 chosen = np.concatenate([by_path, chosen], axis=-1)
             divided.append(NodeRows(structure, nodes, numbers, chosen, i))
     return divided
-
-
-def spread_columns(derivatives: FloatArray, columns: IntArray, width: int) -> FloatArray:
-    """Return derivatives (a, k, m, width) by a path from those (a, k, m, u) at columns (k, u)."""
-    if columns.shape[1] == width and (columns == np.arange(width)).all():
-        return derivatives
-    wide = np.zeros((*derivatives.shape[:3], width + 1))
-    np.put_along_axis(
-        wide, np.broadcast_to(columns[:, None, :], derivatives.shape), derivatives, axis=-1
-    )
-    return wide[..., :width]
 
 
 def fold_node_rows(

@@ -39,7 +39,7 @@ from loopcal.measure.array_checks import drop_repeats, take_rows
 from loopcal.measure.measurements import Measurements
 from loopcal.mechanism.model import Mechanism
 from loopcal.numerics.decomposition import Decomposition
-from loopcal.numerics.elimination import eliminate_columns
+from loopcal.numerics.elimination import eliminate_columns, spread_columns
 from loopcal.numerics.statistics import find_distinct
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
@@ -326,11 +326,9 @@ def divide_by_cluster(
     cluster, factors = estimate.elimination.tree.cluster, []
     for c in find_distinct(cluster[moved[:, 0]]):
         chosen, unknowns = cluster[moved[:, 0]] == c, np.flatnonzero(cluster == c)
-        own = rows[chosen]
-        setup, places = np.zeros((*own.shape[:2], len(unknowns))), moved[chosen]
-        places = np.broadcast_to(np.searchsorted(unknowns, places)[:, None], own[..., :w].shape)
-        np.put_along_axis(setup, places, own[..., :w], axis=2)
-        flat = (each.reshape(len(own) * m, -1) for each in (setup, own[..., w:]))
+        own, machine = np.split(rows[chosen], [w], axis=2)
+        setup = spread_columns(own, np.searchsorted(unknowns, moved[chosen]), len(unknowns))
+        flat = (each.reshape(len(own) * m, -1) for each in (setup, machine))
         factors.append(SourceFactor(source, unknowns, *flat))
     return factors
 

@@ -35,7 +35,7 @@ from loopcal.mechanism.actuation import DrivenJoints
 from loopcal.mechanism.kinematics import close_loops
 from loopcal.mechanism.sensitivity import differentiate_pose, differentiate_sensed_values
 from loopcal.mechanism.states import Status
-from loopcal.numerics.elimination import without_rounding
+from loopcal.numerics.elimination import spread_columns, without_rounding
 from loopcal.numerics.trial_batch import TrialBatch, map_arrays
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
@@ -127,12 +127,8 @@ class LeverageRows(NamedTuple):
 
     def spread(self, count: int) -> FloatArray:
         """Return the rows (k, m, U + p + 1) by all U nuisance parameters."""
-        w = self.unknowns.shape[1]
-        rows = np.zeros((*self.rows.shape[:2], count + self.rows.shape[2] - w))
-        places = np.broadcast_to(self.unknowns[:, None], self.rows[..., :w].shape)
-        np.put_along_axis(rows, places, self.rows[..., :w], axis=2)
-        rows[..., count:] = self.rows[..., w:]
-        return rows
+        moved, machine = np.split(self.rows, [self.unknowns.shape[1]], axis=2)
+        return np.concatenate([spread_columns(moved, self.unknowns, count), machine], axis=2)
 
 
 @dataclass(frozen=True, eq=False)

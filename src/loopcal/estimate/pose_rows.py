@@ -37,7 +37,6 @@ from loopcal.estimate.elimination import (
     divide_among_nodes,
     fold_node_rows,
     list_members,
-    spread_columns,
 )
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.linearization import (
@@ -65,6 +64,7 @@ from loopcal.numerics.elimination import (
     eliminate_columns,
     eliminate_tree,
     find_connected_groups,
+    spread_columns,
 )
 from loopcal.numerics.gauss_newton import Halving, minimize_by_halving
 from loopcal.numerics.statistics import find_distinct

@@ -112,6 +112,17 @@ def build_tree(is_free: BoolArray, scopes: Sequence[str], sets: IntArray) -> Eli
     return _sort_by_structure(node, parent, _components(is_free, pairs))
 
 
+def spread_columns(values: FloatArray, columns: IntArray, width: int) -> FloatArray:
+    """Return values (.., k, m, width) by all columns from those (.., k, m, u) at columns (k, u);
+    those at column `width` are left out.
+    """
+    if columns.shape[1] == width and (columns == np.arange(width)).all():
+        return values
+    wide = np.zeros((*values.shape[:-1], width + 1))
+    np.put_along_axis(wide, np.broadcast_to(columns[:, None], values.shape), values, axis=-1)
+    return wide[..., :width]
+
+
 def find_connected_groups(links: IntArray, count: int) -> IntArray:
     """Return the group (count,) of each item, numbered by first items.
 
@@ -357,14 +368,9 @@ class TreeElimination(TrialBatch):
         Its columns belong to independent standard normal variables; see `roots`.
         """
         chosen = np.arange(self.shift.shape[1]) if unknowns is None else unknowns
-        place = np.full(self.shift.shape[1], -1)
-        place[chosen] = np.arange(len(chosen))
-        joint = np.zeros((len(chosen), len(chosen)))
-        for structure, root in zip(self.tree.structures, self.roots, strict=True):
-            nodes, u = place[structure.unknowns[:, 0]] >= 0, structure.unknowns.shape[1]
-            rows, columns = place[structure.unknowns[nodes]], place[structure.path[nodes]]
-            joint[rows[:, :, None], columns[:, None, :]] = root[0, nodes, :u]
-        return joint
+        unit = np.zeros((self.shift.shape[1], len(chosen)))
+        unit[chosen, np.arange(len(chosen))] = 1.0
+        return self.move_unknowns(unit)[chosen]
 
     def move_unknowns(self, x: FloatArray) -> FloatArray:
         """Return the root of `joint_root` times x (U, c)."""

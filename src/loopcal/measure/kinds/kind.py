@@ -34,7 +34,7 @@ from loopcal.errors import DataError
 from loopcal.measure.array_checks import set_fields
 from loopcal.measure.kinds.setup_parameters import SetupItem, encode_frame
 from loopcal.mechanism.chains import name_platform_entries
-from loopcal.numerics.elimination import without_rounding
+from loopcal.numerics.elimination import spread_columns, without_rounding
 from loopcal.numerics.statistics import find_distinct
 from loopcal.parameters import Parameter
 from loopcal.typing import BoolArray, FloatArray, IntArray
@@ -657,7 +657,7 @@ class Kind(ABC):
         """Return `evaluate` from rows of one target each, of a kind and with parameters at places
         (k, u') of all: work on no derivative that is zero.
         """
-        k, (t, r, c), u = len(places), measured.columns.shape, values.shape[-1]
+        k, (t, r, c) = len(places), measured.columns.shape
         columns = measured.columns.reshape(t, r * k, c // k)
         present = measured.present.reshape(len(measured.present), r * k, -1)
         reference = kind._compute_reference(columns)
@@ -668,21 +668,15 @@ class Kind(ABC):
         )
         each = MeasuredColumns(columns, reference, present, measured.is_complete)
         residual, jacobian, by_own, by_joints = kind.evaluate(T, each, own, joints)
-        t, m = len(residual), residual.shape[2]
-        by_pose = jacobian.reshape(len(jacobian), r, k, *jacobian.shape[2:])
-        by_pose = np.moveaxis(by_pose, 2, -3).reshape(
-            len(by_pose), r, *jacobian.shape[2:-2], k * m, 6
-        )
-        wide = np.zeros((t, r, k, m, u))
-        if by_own is not None:
-            at = np.broadcast_to(places[:, None], (t, r, k, m, places.shape[1]))
-            np.put_along_axis(
-                wide, at, np.broadcast_to(by_own, (t, *by_own.shape[1:])).reshape(at.shape), 4
-            )
-        if by_joints is not None:
-            by_joints = by_joints.reshape(len(by_joints), r, k * m, -1)
+        assert by_own is not None
+        m, links = residual.shape[2], jacobian.shape[2:-2]
+        by_pose = np.moveaxis(jacobian.reshape(-1, r, k, *links, m, 6), 2, -3)
+        by_setup = spread_columns(by_own, np.tile(places, (r, 1)), values.shape[-1])
         return Evaluation(
-            residual.reshape(t, r, k * m), by_pose, wide.reshape(t, r, k * m, u), by_joints
+            residual.reshape(-1, r, k * m),
+            by_pose.reshape(-1, r, *links, k * m, 6),
+            by_setup.reshape(-1, r, k * m, values.shape[-1]),
+            None if by_joints is None else by_joints.reshape(-1, r, k * m, by_joints.shape[-1]),
         )
 
     def _find_platform(self, T: FloatArray, joints: FloatArray) -> FloatArray:
