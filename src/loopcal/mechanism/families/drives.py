@@ -435,11 +435,11 @@ class PlacedRow:
 
     @property
     def law(self) -> dict[str, float]:
-        """Terms of the transmission but those of a triangle."""
+        """Terms of the transmission but weights, and the side of a triangle."""
         terms = {"offset": self.own.terms.get("offset", 0.0), "gain": 0.0}
-        for of in self._list_own_terms().values():
+        for of in self.list_terms().values():
             for term, change in of.maps.items():
-                if of.nominal:
+                if of.nominal and not term.startswith(WEIGHT):
                     terms[term] = terms.get(term, 0.0) + change * of.nominal
         return terms
 
@@ -453,7 +453,7 @@ class PlacedRow:
             sums = {"weights": self.weights, "column": drive.condition}
             return Actuator(self.name, drive.GIVEN, None, terms, **sums)
         if isinstance(drive, TriangleDrive):
-            terms |= place_triangle(self.name, drive, self.joint.rotation, self.joint.start)
+            terms |= choose_side(self.name, drive, terms, self.joint.start)
         return Actuator(
             self.name,
             drive.READING,
@@ -783,7 +783,8 @@ def _word_stroke(placed: PlacedRow) -> str:
     if not isinstance(placed.drive, TriangleDrive):
         return ""
     terms = placed.actuator.terms
-    low, high = (float(end) for end in compute_range(np.array([terms[t] for t in TRIANGLE_TERMS])))
+    triangle = np.array([terms.get(term, 0.0) for term in TRIANGLE_TERMS])
+    low, high = (float(end) for end in compute_range(triangle))
     ends = [terms["offset"] + terms["gain"] * reading for reading in placed.stroke or ()]
     outside = [f"{end * 1e3:.6g} mm" for end in ends if np.isfinite(end) and not low <= end <= high]
     if not outside:
@@ -860,23 +861,17 @@ def _check_table(placed: PlacedRow, drive: Drive) -> None:
 # Triangles: a linear actuator between two anchors beside a rotary joint.
 
 
-def place_triangle(
-    name: str, drive: TriangleDrive, rotation: FloatArray, start: float
-) -> Mapping[str, float]:
-    """Return the terms of a triangle in the joint's own frame, by name.
-
-    rotation : (3, 3) R_placed_joint, whose third column is the joint's axis. start : angle of the
-        joint near home [rad], which selects the side.
-    Raises MechanismError: an anchor on the axis, a start at a dead point, or a stroke that no angle
-        reaches.
+def choose_side(
+    name: str, drive: TriangleDrive, stated: Mapping[str, float], start: float
+) -> dict[str, float]:
+    """Return the side of a triangle at the angle of its joint near home [rad], and the middle of
+    this side. stated : the other terms. Raises RecordError: an anchor on the axis, or a start at a
+    dead point.
     """
-    triangle = drive.triangle
-    points = np.array([triangle.foot, triangle.head]) @ rotation
-    skew = rotation.T @ [triangle.skew.rx, triangle.skew.ry, triangle.skew.rz]
-    terms = np.array([*points.ravel(), *skew[:2], 1.0, 0.0])
+    terms = np.array([stated.get(term, 0.0) for term in TRIANGLE_TERMS])
     low, high = (float(end) for end in compute_range(terms))
     # b of l^2 = a - b cos(theta - gamma) is twice the product of both levers
-    if not high**2 - low**2 > 4 * ON_AXIS * float((points**2).sum(axis=1).max()):
+    if not high**2 - low**2 > 4 * ON_AXIS * (terms[:6].reshape(2, 3) ** 2).sum(axis=1).max():
         sentence = "has a degenerate triangle: an anchor is on the axis of the joint, so all angles"
         raise drive.refuse(name, f"{sentence} give one length. Give anchors away from the axis")
     sine, middle = find_side(start, terms)
@@ -887,8 +882,7 @@ def place_triangle(
             "both anchors and the axis are in one plane. Give another `start:` of the joint, or "
             "other anchors",
         )
-    terms[-2:] = np.sign(sine), middle
-    return dict(zip(TRIANGLE_TERMS, (float(term) for term in terms), strict=True))
+    return {"side": float(np.sign(sine)), "middle": middle}
 
 
 def list_triangle_terms(drive: TriangleDrive, rotation: FloatArray) -> Iterator[tuple[str, Term]]:
