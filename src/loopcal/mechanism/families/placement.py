@@ -347,36 +347,27 @@ def offset_error(
     return single_error(name, dimension, nominal, tolerance, offset, positive=positive)
 
 
-def complete_errors(limb: PlacedLimb, spread: LinkTolerances, places_body: bool) -> ErrorModel:
-    """Return all errors of the links of a limb. Those of an attachment that `places_body` are none:
-    they move the frame of the body.
-    """
-    own, is_rigid = limb.limb, limb.limb.ending == "rigid"
-    chosen = [(joint.name, KEPT_AXES[joint.kind]) for joint in own.joints]
-    if not is_rigid:
-        chosen.append((own.links[-1].name, AXES[3:]))
-    if not places_body:
-        chosen.append((own.attachment.name, AXES if is_rigid else AXES[3:]))
-    errors: list[ErrorModel] = []
-    for element, axis in ((element, axis) for element, axes in chosen for axis in axes):
-        name, dimension = f"{limb.name}.{element}.{axis}", get_axis_dimension(axis)
-        entry = LinearMap(name, Address(limb.name, element, axis))
-        errors.append(single_error(name, dimension, 0.0, spread.select(dimension), entry))
-    if own.ending == "distance" and not own.actuator:
-        errors.append(
-            rod_length_error(limb, f"{limb.name}.length", spread.select(Dimension.LENGTH))
-        )
-    return join_errors(errors)
-
-
 def complete_limbs(limbs: Sequence[PlacedLimb], spread: LinkTolerances) -> ErrorModel:
     """Return all errors of the links of all limbs."""
     # the first rigid limb of a body places its frame, so that errors of its end are none
-    rigid = [limb for limb in limbs[::-1] if limb.limb.ending == "rigid"]
-    places = {limb.limb.to: limb.name for limb in rigid if limb.limb.to != PLATFORM}
-    return join_errors(
-        complete_errors(limb, spread, places.get(limb.limb.to) == limb.name) for limb in limbs
-    )
+    places = {limb.limb.to: limb.name for limb in limbs[::-1] if limb.limb.ending == "rigid"}
+    errors: list[ErrorModel] = []
+    for limb in limbs:
+        name, own = limb.name, limb.limb
+        is_rigid = own.ending == "rigid"
+        chosen = [(joint.name, KEPT_AXES[joint.kind]) for joint in own.joints]
+        if not is_rigid:
+            chosen.append((own.links[-1].name, AXES[3:]))
+        if own.to == PLATFORM or places.get(own.to) != name:
+            chosen.append((own.attachment.name, AXES if is_rigid else AXES[3:]))
+        for element, axis in ((element, axis) for element, axes in chosen for axis in axes):
+            parameter, dimension = f"{name}.{element}.{axis}", get_axis_dimension(axis)
+            entry = LinearMap(parameter, Address(name, element, axis))
+            errors.append(single_error(parameter, dimension, 0.0, spread.select(dimension), entry))
+        if own.ending == "distance" and not own.actuator:
+            sd = spread.select(Dimension.LENGTH)
+            errors.append(rod_length_error(limb, f"{name}.length", sd))
+    return join_errors(errors)
 
 
 def get_axis_dimension(axis: str) -> Dimension:
