@@ -17,11 +17,6 @@ name_presenters(
     page=["loopcal.report.calibration_view", "loopcal.report.validation_view"],
     figure=[
         f"loopcal.report.{module}"
-        for module in (
-            "figures.fit_figures",
-            "figures.plan_figures",
-            "figures.result_figures",
-            "scene.scene",
-        )
+        for module in ("figures.fit_figures", "figures.result_figures", "scene.scene")
     ],
 )

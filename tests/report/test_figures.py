@@ -24,8 +24,7 @@ from loopcal.report.figures.fit_figures import (
     draw_residuals,
     list_series,
 )
-from loopcal.report.figures.plan_figures import draw_plan
-from loopcal.report.figures.result_figures import draw_accuracy_map, draw_validation
+from loopcal.report.figures.result_figures import draw_accuracy_map, draw_plan, draw_validation
 from loopcal.report.figures.style import label_poses, shorten, start_figure
 from loopcal.report.pictures import render_figure
 from loopcal.report.scene.scene import draw_robot

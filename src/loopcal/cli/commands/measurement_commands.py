@@ -445,7 +445,7 @@ def _write_plan(
     from loopcal.io.core.outputs import write_result_folder
     from loopcal.io.runs import plan_folder
     from loopcal.planning.pose_planning import list_stops
-    from loopcal.report.figures.plan_figures import draw_curve, draw_plan
+    from loopcal.report.figures.result_figures import draw_curve, draw_plan
     from loopcal.report.pictures import render_figure
 
     figures = {}
