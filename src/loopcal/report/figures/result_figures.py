@@ -30,7 +30,8 @@ from loopcal.mechanism.platform_coordinates import (
 from loopcal.planning.path import locate_home
 from loopcal.planning.plane_line_planning import SurfacePlan
 from loopcal.planning.pose_planning import Plan, PlannedPoses
-from loopcal.planning.problem import DIMENSIONS, ErrorCurve
+from loopcal.planning.problem import DIMENSIONS as TARGETS
+from loopcal.planning.problem import ErrorCurve
 from loopcal.report.figures.style import (
     COLORS,
     DARK,
@@ -741,7 +742,7 @@ def draw_curve(robot: Mechanism, curve: ErrorCurve) -> Figure:
     """Draw errors by the number of poses: what the share of machines ends below, the root mean
     square of all machines, and the bound of that which no choice of so many candidates can beat.
     """
-    unit = find_unit(robot.units[DIMENSIONS[curve.target]])
+    unit = find_unit(robot.units[TARGETS[curve.target]])
     figure = start_figure(6.4, 4.4)
     axes: Any = figure.add_subplot(1, 1, 1)
     for errors, line, color, label in (
