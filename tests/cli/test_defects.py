@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from loopcal.cli.commands import robot_commands
+from loopcal.cli.commands import file_commands
 from loopcal.cli.entry_point import main
 
 DEFECTS = {
@@ -24,10 +24,10 @@ SCRIPT = """
 import sys
 import numpy as np
 from loopcal.cli.entry_point import main
-from loopcal.cli.commands import robot_commands
+from loopcal.cli.commands import file_commands
 np.seterr(divide="raise")
 f = lambda: f()
-robot_commands.check.callback = lambda **_: {}
+file_commands.check.callback = lambda **_: {}
 sys.exit(main(["check", "hexapod-42"]))
 """
 
@@ -65,7 +65,7 @@ def test_every_kind_of_defect_is_reported(name, tmp_path, monkeypatch, capsys) -
         with np.errstate(divide="raise"):
             eval(DEFECTS[name], {"np": np, "f": f})
 
-    monkeypatch.setattr(robot_commands.check, "callback", fail)
+    monkeypatch.setattr(file_commands.check, "callback", fail)
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     assert main(["check", "hexapod-42"]) == 3
     out, err = capsys.readouterr()
@@ -87,7 +87,7 @@ def test_report_is_saved_in_the_current_folder_where_there_is_no_temporary_one(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "missing"))
-    monkeypatch.setattr(robot_commands.check, "callback", lambda **_: 1 / 0)
+    monkeypatch.setattr(file_commands.check, "callback", lambda **_: 1 / 0)
     assert main(["check", "hexapod-42"]) == 3
     (report,) = tmp_path.iterdir()
     assert report.name in capsys.readouterr().err
@@ -98,7 +98,7 @@ def test_defect_without_a_place_for_the_report_is_still_one_sentence(monkeypatch
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("tempfile.mkstemp", refuse)
-    monkeypatch.setattr(robot_commands.check, "callback", lambda **_: 1 / 0)
+    monkeypatch.setattr(file_commands.check, "callback", lambda **_: 1 / 0)
     assert main(["check", "hexapod-42"]) == 3
     err = capsys.readouterr().err
     assert "Saving the report failed: send the developers this message, the command" in err

@@ -10,7 +10,7 @@ import click
 import pytest
 
 import loopcal as lc
-from loopcal.cli.commands import robot_commands
+from loopcal.cli.commands import file_commands
 from loopcal.cli.commands.study_commands import study
 from loopcal.cli.entry_point import command_line, main
 
@@ -120,7 +120,7 @@ def test_user_error_prints_one_sentence_and_gives_exit_code_1(
     def fail(*_args, **_kwargs):
         raise error
 
-    monkeypatch.setattr(robot_commands.check, "callback", fail)
+    monkeypatch.setattr(file_commands.check, "callback", fail)
     assert main(["check", "hexapod-42"]) == 1
     out, err = capsys.readouterr()
     assert out == ""

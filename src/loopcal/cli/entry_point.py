@@ -35,19 +35,19 @@ from loopcal.output_record import record_outputs
 
 SECTIONS = {
     "Describe the robot": {
-        "new": ("robot", "Write a robot file, and a measurement file, to fill in."),
-        "check": ("robot", "Read a robot file and show what it contains."),
-        "view": ("robot", "Show a robot, or a calibration, as a 3-D view in the browser."),
-        "schema": ("robot", "Print the JSON Schema of a kind of file, for editors."),
-        "import": ("exchange", "Read the file of a controller as a robot file."),
-        "export": ("exchange", "Write identified numbers into the file of a controller."),
+        "new": ("file", "Write a robot file, and a measurement file, to fill in."),
+        "check": ("file", "Read a robot file and show what it contains."),
+        "view": ("file", "Show a robot, or a calibration, as a 3-D view in the browser."),
+        "schema": ("file", "Print the JSON Schema of a kind of file, for editors."),
+        "import": ("file", "Read the file of a controller as a robot file."),
+        "export": ("file", "Write identified numbers into the file of a controller."),
     },
     "Prepare measurements": {
         "identifiability": ("measurement", "Show which parameters measurements determine."),
         "plan": ("measurement", "Plan which poses to measure, and write a sheet for them."),
-        "gcode": ("exchange", "Write a program that moves a machine to the poses of a plan."),
+        "gcode": ("file", "Write a program that moves a machine to the poses of a plan."),
         "measure": ("session", "Measure the poses of a plan with a companion."),
-        "fill": ("exchange", "Fill in the sheet of a plan from the export of an instrument."),
+        "fill": ("file", "Fill in the sheet of a plan from the export of an instrument."),
         "board": ("measurement", "Draw a board to print, for pictures by a phone or camera."),
         "photos": ("measurement", "Find the corners of a printed board in pictures."),
         "simulate": ("measurement", "Write a measurement file of a simulated machine."),
@@ -86,8 +86,8 @@ SECTIONS = {
         "per-leg": ("study", "Identify a hexapod leg by leg, to compare with calibrate."),
     },
     "Begin": {
-        "example": ("robot", "Write the files of an example, to try the commands with."),
-        "completion": ("robot", "Print the script with which a shell completes commands."),
+        "example": ("file", "Write the files of an example, to try the commands with."),
+        "completion": ("file", "Print the script with which a shell completes commands."),
     },
 }
 """Heading of the help -> command -> its module, imported when it runs, and what it does."""

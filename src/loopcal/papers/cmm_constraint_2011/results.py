@@ -696,13 +696,11 @@ def _list_table_3(results: Results, name: str, measures: tuple[str, ...]) -> pub
                       poses=study.grid.scores.held_out)  # fmt: skip
 
 
-def make_figures(results: Results) -> tuple[published.Figure, ...]:
-    """Return all figures."""
-    return _draw_figure_4(results), _draw_figure_5(results), _draw_table_3(results)
-
-
-def _draw_figure_4(results: Results) -> published.Figure:
-    """Return pose error over parameter error, both after / before, so that growth has a place."""
+def make_figures(results: Results) -> Iterator[published.Figure]:
+    """Yield pose error over parameter error, both after / before, so that growth has a place;
+    position errors of single poses of the first machine, before and after; and the position error
+    by noise, for each set of errors.
+    """
     absolute = (PARAMETERS, name_measure("position", ABSOLUTE))
     lines = []
     for frame, measures in {"": absolute, ", aligned": (DETERMINED, POSITION)}.items():
@@ -713,11 +711,8 @@ def _draw_figure_4(results: Results) -> published.Figure:
             )
             x, y = zip(*both, strict=True)
             lines.append(published.Series.of(f"{method}{frame}", x, y))
-    return TEXT.figure("figure_4", lines, joined=False, count=len(results.cells))
+    yield TEXT.figure("figure_4", lines, joined=False, count=len(results.cells))
 
-
-def _draw_figure_5(results: Results) -> published.Figure:
-    """Return position errors of single poses of the first machine, before and after."""
     study, made, sizes = results.study, results.figure_5, {}
     true = study.solve(made.truth[:1])
     for name, values in made.values.items():
@@ -729,21 +724,18 @@ def _draw_figure_5(results: Results) -> published.Figure:
     order = np.argsort(sizes[BEFORE])
     x = range(1, len(order) + 1)
     lines = [published.Series.of(label, x, size[order]) for label, size in sizes.items()]
-    return TEXT.figure("figure_5", lines, joined=False, errors=study.describe_errors(made.size),
-                       noise=made.noise, count=len(order))  # fmt: skip
+    yield TEXT.figure("figure_5", lines, joined=False, errors=study.describe_errors(made.size),
+                      noise=made.noise, count=len(order))  # fmt: skip
 
-
-def _draw_table_3(results: Results) -> published.Figure:
-    """Return the position error by noise, for each set of errors."""
     lines, levels = [], {}
-    for given in results.study.grid.errors:
+    for given in study.grid.errors:
         cells = [cell for (of_set, _), cell in results.cells.items() if of_set == given]
-        name = f"errors of {results.study.describe_errors(given)}"
+        name = f"errors of {study.describe_errors(given)}"
         levels[f"before, {name}"] = cells[0].compute_median(BEFORE, POSITION)
         for method in METHODS:
             y = [cell.compute_median(method, POSITION) for cell in cells]
             lines.append(published.Series.of(f"{method}, {name}", [c.noise for c in cells], y))
-    return TEXT.figure("table_3", lines, levels, trials=results.trials)
+    yield TEXT.figure("table_3", lines, levels, trials=results.trials)
 
 
 def judge_claims(results: Results) -> tuple[published.Verdict, ...]:

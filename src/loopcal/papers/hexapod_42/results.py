@@ -634,26 +634,20 @@ def _describe_noise(name: str) -> str:
     return f"noise within +-{length:g} mm, +-{angle:g} rad"
 
 
-def make_figures(results: Results) -> tuple[published.Figure, ...]:
-    """Return all figures."""
-    return _draw_figure_4(results), _draw_noise(results)
-
-
-def _draw_figure_4(results: Results) -> published.Figure:
-    """Return max dQint by iteration."""
+def make_figures(results: Results) -> Iterator[published.Figure]:
+    """Yield max dQint by iteration, and the sizes after calibration by noise, with 1e-3 rad of
+    angle noise per mm.
+    """
     threshold, count = results.setup.epsilon, len(results.setup.poses)
     labels = (*RUNS, _describe_noise(PRESUMED), _describe_noise(STATED))
     lines = [
         published.Series.of(label, range(len(run.integrated)), run.integrated)
         for label, run in zip(labels, results.runs.values(), strict=True)
     ]
-    levels = {f"rule {threshold:g}": threshold}
-    return TEXT.figure("figure_4", lines, levels, threshold=threshold, count=count,
-                       iterations=count_printed(), tables=results.setup.is_printed)  # fmt: skip
+    rule = {f"rule {threshold:g}": threshold}
+    yield TEXT.figure("figure_4", lines, rule, threshold=threshold, count=count,
+                      iterations=count_printed(), tables=results.setup.is_printed)  # fmt: skip
 
-
-def _draw_noise(results: Results) -> published.Figure:
-    """Return the sizes after calibration by noise, with 1e-3 rad of angle noise per mm."""
     levels = [
         level
         for level in sorted(results.levels.values(), key=lambda level: level.limits)
@@ -667,7 +661,7 @@ def _draw_noise(results: Results) -> published.Figure:
     ]
     marks = {"parameter error before calibration": results.methods["before"].rms["parameters"]}
     stated, trials = results.levels[STATED].limits[0], len(levels[0].needed)
-    return TEXT.figure("noise", lines, marks, trials=trials, noise=stated)
+    yield TEXT.figure("noise", lines, marks, trials=trials, noise=stated)
 
 
 def judge_claims(results: Results) -> tuple[published.Verdict, ...]:
