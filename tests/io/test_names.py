@@ -11,8 +11,8 @@ from loopcal.io.core.csv_table import read_table
 from loopcal.io.core.limits import (
     LONGEST_COMPOSED,
     LONGEST_NAME,
+    TEXT_LENGTH,
     find_fault,
-    find_text_fault,
     format_comment,
     is_formula,
     make_name,
@@ -65,8 +65,11 @@ def test_rule_refuses_what_is_not_plain_or_computed() -> None:
     assert set(list_codes(*FORMULAS)) == {"files.name-computed"}
     assert set(list_codes(*ALLOWED)) == {None}
     assert list_codes("x" * LONGEST_NAME, "x" * (LONGEST_NAME + 1)) == [None, "files.name-too-long"]
-    assert find_text_fault("two\nlines of =1 " + "x" * LONGEST_COMPOSED) is None
-    assert find_text_fault("\x1b") is not None
+    assert (
+        find_fault("two\nlines of =1 " + "x" * LONGEST_COMPOSED, TEXT_LENGTH.count, is_text=True)
+        is None
+    )
+    assert find_fault("\x1b", is_text=True) is not None
 
 
 @pytest.mark.parametrize("name", [*CONTROLS, *LINES, *FORMULAS])

@@ -13,7 +13,7 @@ import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from loopcal.errors import FileError
 from loopcal.findings import Finding, report_finding
@@ -296,24 +296,28 @@ the labels `+x` and `-1`, are none.
 """
 
 
-def find_fault(name: str, longest: int = LONGEST_NAME) -> Finding | None:
-    """Return why a file must not contain a name of at most `longest` characters, or None."""
-    if (fault := _find_fault(name, "name", "", longest)) is not None:
-        return fault
-    return report_finding("files.name-computed", name=quote(name)) if is_formula(name) else None
+def find_fault(name: str, longest: int = LONGEST_NAME, is_text: bool = False) -> Finding | None:
+    """Return why a file must not contain a name of at most `longest` characters, or a text that is
+    no name, which may have several lines; None where it may.
+    """
+    what, length, facts = "text" if is_text else "name", len(name), dict[str, Any]()
+    if (character := find_not_plain(name, "\n\t" if is_text else "")) is not None:
+        code, facts = "files.name-not-plain", {"what": what, "character": name_character(character)}
+    elif length > longest:
+        code, facts = "files.name-too-long", {"what": what, "length": length, "longest": longest}
+    elif is_formula(name) and not is_text:
+        code = "files.name-computed"
+    else:
+        return None
+    return report_finding(code, name=quote(name), **facts)
 
 
 def find_fault_below(keys: Iterable[str | int], text: str) -> Finding | None:
     """Return why a YAML file must not contain a text below some keys, or as the last of them."""
     if not TEXT_KEYS.isdisjoint(keys):
-        return find_text_fault(text)
+        return find_fault(text, TEXT_LENGTH.count, is_text=True)
     is_composed = not COMPOSED_KEYS.isdisjoint(keys)
     return find_fault(text, LONGEST_COMPOSED if is_composed else LONGEST_NAME)
-
-
-def find_text_fault(text: str) -> Finding | None:
-    """Return why a file must not contain a text that is no name; it may have several lines."""
-    return _find_fault(text, "text", "\n\t", TEXT_LENGTH.count)
 
 
 def is_formula(cell: str) -> bool:
@@ -334,17 +338,3 @@ def format_comment(text: str) -> str:
     """
     line = escape(" ".join(text.split()))
     return re.sub("[,;]", " ", line) if is_formula(line) else line
-
-
-def _find_fault(text: str, what: str, allowed: str, longest: int) -> Finding | None:
-    """Return what is wrong with the characters or the length of a text."""
-    character = find_not_plain(text, allowed)
-    if character is not None:
-        named = name_character(character)
-        return report_finding("files.name-not-plain", what=what, name=quote(text), character=named)
-    if len(text) > longest:
-        n = len(text)
-        return report_finding(
-            "files.name-too-long", what=what, name=quote(text), length=n, longest=longest
-        )
-    return None
