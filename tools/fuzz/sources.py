@@ -168,8 +168,33 @@ MJCF = """<mujoco><worldbody>
 <actuator><motor joint="mot1"/><motor joint="mot2"/></actuator></mujoco>
 """
 
+ROTARY = """\
+[printer]
+kinematics: rotary_delta
+shoulder_radius: 33.9
+shoulder_height: 412.9
+[stepper_a]
+gear_ratio: 107.000:16, 60:16
+microsteps: 16
+position_endstop: 252
+upper_arm_length: 170
+lower_arm_length: 320
+[stepper_b]
+gear_ratio: 107.000:16, 60:16
+microsteps: 16
+[stepper_c]
+gear_ratio: 107.000:16, 60:16
+microsteps: 16
+angle: 270.3
+#*# <---------------------- SAVE_CONFIG ---------------------->
+#*# [delta_calibrate]
+#*# height0 = 0.003
+#*# height0_pos = 20774.917,20864.322,20800.461
+"""
+
 SOURCES = {
     "printer.cfg": DELTA_PROBES,
+    "rotary.cfg": ROTARY,
     "robot.g": REPRAP,
     "marlin.g": MARLIN,
     "hexapod.hal": GENHEX,

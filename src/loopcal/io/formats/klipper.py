@@ -146,7 +146,11 @@ class KlipperConfig(ValueFile):
         lines += [*first, f"{MARK} [{section}]{end}", line]
 
 
-def read_config(path: Path, allowed: Sequence[str] = ("delta", "rotary_delta")) -> KlipperConfig:
+DELTAS = ("delta", "rotary_delta")
+"""Kinematics that are read and written."""
+
+
+def read_config(path: Path, allowed: Sequence[str] = DELTAS) -> KlipperConfig:
     """Read a configuration; FileError where its saved part was edited, or it is of no delta."""
     cfg = KlipperConfig.load(path)
     is_stated = cfg.has("printer", "kinematics")
@@ -154,6 +158,9 @@ def read_config(path: Path, allowed: Sequence[str] = ("delta", "rotary_delta")) 
     sections = tuple(dict.fromkeys(section for section, _ in cfg.values))
     if kinematics in allowed or (not is_stated and (cfg.includes or STEPPERS[0] in sections)):
         return cfg
+    if kinematics in DELTAS:
+        sentence = f"this printer's kinematics is {kinematics!r}, but the robot is {allowed[0]!r}"
+        raise cfg.error(f"{sentence}. Name the file of the robot", "printer", "kinematics")
     raise cfg.error(report_kinematics(kinematics, sections[:4]), "printer", "kinematics")
 
 
