@@ -117,6 +117,18 @@ def test_machines_without_tables_are_refused() -> None:
     assert reasons == ["tilt", "height", "equal", "other"]
 
 
+def test_a_controller_that_reaches_no_pose_is_refused() -> None:
+    robot = lc.load_robot("linear-delta")
+    arms = np.array([name.startswith("arm") for name in robot.parameters.names])
+    short = robot.with_values(
+        np.where(arms, 0.106, robot.values)
+    )  # one millimeter above its radius
+    with pytest.raises(DataError) as refused:
+        make_tables(robot, short.with_values(short.values), GRID)
+    assert refused.value.finding is not None
+    assert refused.value.finding.data["reason"] in ("nowhere", "reach")
+
+
 def test_a_corner_out_of_reach_is_named_with_its_place(tmp_path) -> None:
     text = list_shipped_robots()["linear-delta"].read_text("utf-8")
     wide = text.replace("x: [-60, 60], y: [-60, 60]", "x: [-190, 190], y: [-190, 190]")

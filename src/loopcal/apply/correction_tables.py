@@ -110,7 +110,7 @@ def make_tables(
     controller : the geometry that it computes with. limit : error that may remain [m], of an
     orientation by its arc at the robot's size; a tenth of the largest error by default.
 
-    DataError : the controller errs nowhere, or a node is out of reach.
+    DataError : the controller errs nowhere or has other coordinates, or a node is out of reach.
     """
     names, reason = robot.controlled, ""
     if set(names) & set(TILT):
@@ -142,6 +142,8 @@ def make_tables(
         targets = place(draw_coordinates(np.random.default_rng(0), tuple(axes), ranges, CHECKS))
     before = machine.lead(targets, targets)
     targets, before = (rows[np.isfinite(before).all(axis=1)] for rows in (targets, before))
+    if not len(targets):
+        raise DataError(_refuse(robot, "nowhere"))
     tables, after = list[CorrectionTable](), before
     if size.what == "skew":
         tables, before, after = _fit_skew(machine, targets, before)
