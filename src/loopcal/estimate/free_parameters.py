@@ -16,7 +16,7 @@ import numpy as np
 from loopcal.estimate.smooth_errors import SmoothErrors
 from loopcal.findings import Finding, Quantity, report_finding
 from loopcal.mechanism.model import Mechanism, ParameterUnits
-from loopcal.mechanism.over_constraint import refuse_free_breaking_parameters
+from loopcal.mechanism.over_constraint import refuse_breaking_parameters
 from loopcal.parameters import Parameter
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension
@@ -134,7 +134,7 @@ def select_free_parameters(robot: Mechanism) -> FreeParameters:
     MechanismError
         The robot is over-constrained, and its loops do not close with other values of some.
     """
-    refuse_free_breaking_parameters(robot)
+    refuse_breaking_parameters(robot)
     table = robot.parameters
     places = np.flatnonzero(table.free)
     stated = table.tolerance[places]

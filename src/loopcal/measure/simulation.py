@@ -37,7 +37,7 @@ from loopcal.mechanism.actuation import solve_at_pose
 from loopcal.mechanism.assembly import FORCES
 from loopcal.mechanism.kinematics import forward_trials, load_readings
 from loopcal.mechanism.model import Mechanism
-from loopcal.mechanism.over_constraint import refuse_drawn_errors
+from loopcal.mechanism.over_constraint import refuse_breaking_parameters
 from loopcal.mechanism.platform_coordinates import POSITION, read_coordinates
 from loopcal.mechanism.solutions import forward, inverse
 from loopcal.mechanism.states import Status
@@ -193,7 +193,7 @@ def sample_truth(
     MechanismError : the robot is over-constrained, so that its loops do not close with such errors.
     """
     check_type(robot, Mechanism, "robot", "from loopcal.load_robot")
-    refuse_drawn_errors(robot)
+    refuse_breaking_parameters(robot, drawn=True)
     if distribution not in get_args(Distribution):
         raise DataError(f"distribution is {distribution!r}. Give 'normal' or 'uniform'")
     table = robot.parameters

@@ -469,9 +469,7 @@ def _solve_by_drives(
     wanted = np.broadcast_to(target, (t, n, target.shape[2])).reshape(t * n, -1)
     own = values if len(values) == 1 else np.repeat(values, n, axis=0)
     rows = _make_rows(robot, own, wanted)
-    first = map_arrays(
-        lambda a: np.broadcast_to(a, (t, n, *a.shape[2:])).reshape(t * n, 1, *a.shape[2:]), begin
-    )
+    first = begin.select((t, n), *np.divmod(np.arange(t * n), n))
     start = _begin(rows, first)
     rows = replace(rows, sign=start.sign)
     last = _solve_within_reach(rows, start, first, follow)

@@ -277,25 +277,19 @@ def is_over_constrained(robot: Mechanism) -> bool:
     return find_over_constraint(robot) is not None
 
 
-def refuse_free_breaking_parameters(robot: Mechanism) -> None:
-    """Refuse free parameters that open the loops of an over-constrained robot."""
-    if names := find_breaking_parameters(robot):
-        raise MechanismError(_report_breaking("mechanism.free-parameters-open-loops", robot, names))
-
-
-def refuse_drawn_errors(robot: Mechanism) -> None:
-    """Refuse parameters with a tolerance that open the loops of an over-constrained robot."""
-    table = robot.parameters
-    drawn = {p.name for p in table.entries if p.tolerance}
-    if names := tuple(name for name in find_breaking_parameters(robot) if name in drawn):
-        raise MechanismError(_report_breaking("mechanism.drawn-errors-open-loops", robot, names))
-
-
-def _report_breaking(code: str, robot: Mechanism, names: tuple[str, ...]) -> Finding:
-    """Return the finding of parameters that open loops."""
-    finding = find_over_constraint(robot)
-    assert finding is not None
-    return report_finding(code, name=robot.name, names=names, repeated=finding.data["repeated"])
+def refuse_breaking_parameters(robot: Mechanism, drawn: bool = False) -> None:
+    """Refuse free parameters that open the loops of an over-constrained robot; if errors are drawn,
+    those with a tolerance.
+    """
+    names, finding = find_breaking_parameters(robot), find_over_constraint(robot)
+    code = "mechanism.free-parameters-open-loops"
+    if drawn:
+        code, known = "mechanism.drawn-errors-open-loops", robot.parameters.entries
+        names = tuple(p.name for p in known if p.tolerance and p.name in names)
+    if names:
+        assert finding is not None
+        repeated = finding.data["repeated"]
+        raise MechanismError(report_finding(code, name=robot.name, names=names, repeated=repeated))
 
 
 def find_breaking_parameters(robot: Mechanism) -> tuple[str, ...]:
