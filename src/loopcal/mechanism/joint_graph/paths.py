@@ -279,6 +279,9 @@ def _list_joint_twists(
 FIRM, FIRM_DRAWN = 0.5, 0.01
 """Share of the best firmness that a home pose must have, and the pose that was drawn [1]."""
 
+FLOATING = 6
+"""Number of passive joints by which a file lets the base of a machine float."""
+
 PARALLEL, ALONG = 1e-9, 1e-12
 """Largest sine between axes that count as parallel, and component across an axis of a frame [1]."""
 
@@ -360,7 +363,9 @@ def find_stage_paths(
     `measure_rounding` the rounding errors [m, rad] of numbers that describe some bodies. Refusals
     name the joints.
     """
-    path = _leave_floating(find_blocks(whole, platform))
+    path = find_blocks(whole, platform)
+    floating = next((i for i, block in enumerate(path) if block.graph.motors), 0)
+    path = path[floating:] if floating >= FLOATING else path
     whole = replace(whole, base=path[0].graph.base)
     kept = select_joints(whole, {joint for block in path for joint in block.graph.joints})
     repair = _repair_blocks(kept, find_blocks(kept, platform), measure_rounding)
@@ -382,7 +387,7 @@ def find_stage_paths(
     stages: list[ClosedStage | SerialStage] = []
     for block, mount in map(_turn_base, blocks):
         frame = locate_frame(block.platform)
-        values = _select(graph, home, block)
+        values = home[[graph.names.index(name) for name in block.graph.names]]
         if block.is_serial and len(blocks) > 1 and block.graph.tree[0].is_plain:
             stages.append(SerialStage(block.graph.tree[0], float(values[0]), frame))
         else:
@@ -394,16 +399,6 @@ def find_stage_paths(
     dangling = tuple(joint.name for joint in whole.joints if joint.name not in names)
     outside = tuple(name for name in whole.motors if name not in graph.motors)
     return StagePaths(graph, home, platform, tuple(stages), motions, dangling, outside, repair)
-
-
-FLOATING = 6
-"""Number of passive joints by which a file lets the base of a machine float."""
-
-
-def _leave_floating(path: tuple[Block, ...]) -> tuple[Block, ...]:
-    """Return the blocks behind the joints that only let the base float."""
-    count = next((i for i, block in enumerate(path) if block.graph.motors), 0)
-    return path[count:] if count >= FLOATING else path
 
 
 def list_possible_platforms(graph: JointGraph) -> tuple[str, ...]:
@@ -458,11 +453,6 @@ def _repair_blocks(
         max((repair.angle for repair in repairs), default=0.0),
         max((repair.turn for repair in repairs), default=0.0),
     )
-
-
-def _select(graph: JointGraph, q: FloatArray, block: Block) -> FloatArray:
-    """Return the values (b,) of the joints of a block."""
-    return q[[graph.names.index(name) for name in block.graph.names]]
 
 
 def _turn_base(block: Block) -> tuple[Block, FloatArray]:
