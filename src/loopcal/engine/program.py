@@ -320,11 +320,6 @@ class Target:
     torsion: bool
     base: FloatArray
 
-    @property
-    def has_turns(self) -> bool:
-        """Whether an angle is stated."""
-        return max(self.columns[3:]) >= 0
-
 
 @dataclass(frozen=True, eq=False)
 class Reached:

@@ -126,9 +126,12 @@ def compare_coordinates(
             rotation, wanted["phi"], wanted["theta"], size
         )
     if "psi" in wanted:
-        place, (angle, row) = names.index("psi"), _torsion(rotation)
+        place, normal = names.index("psi"), rotation[:, :, 2]
+        angle = geometry.matrix_to_tilt_torsion(rotation)[..., 2]
         residual[:, place] = size * geometry.wrap_angle(angle - wanted["psi"])
-        columns[:, place, :3] = size * row
+        # d psi = (ez + n) . omega / (1 + cos theta): orthogonal to the axes that phi and theta turn
+        # about
+        columns[:, place, :3] = size * ((normal + np.eye(3)[2]) / (1.0 + normal[:, 2:]))
     if set(EULER) & set(names):
         angles = geometry.matrix_to_euler(rotation, "xyz")
         rates = geometry.euler_rates_inverse(angles, "xyz")
@@ -156,13 +159,3 @@ def _compare_normals(
     residual = np.einsum("nij,nj->ni", across, normal)
     # d normal = omega x normal, so d (a . normal) = (normal x a) . omega
     return size * residual, size * np.cross(normal[:, None], across)
-
-
-def _torsion(rotation: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return psi (N,) and its slope in the angular velocity (N, 3)."""
-    # d psi = (ez + n) . omega / (1 + cos theta): orthogonal to the axes that phi and theta turn
-    # about
-    normal = rotation[:, :, 2]
-    left = 1.0 + normal[:, 2:]  # zero upside down, where torsion has no meaning, and no slope
-    row = (normal + np.eye(3)[2]) * np.divide(1.0, left, out=np.zeros_like(left), where=left > 0)
-    return geometry.matrix_to_tilt_torsion(rotation)[..., 2], row

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from loopcal import geometry
 from loopcal.engine import State
 from loopcal.errors import MechanismError
-from loopcal.findings import Finding, report_finding
+from loopcal.findings import report_finding
 from loopcal.findings.wording import round_to_digits
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.solutions import Solution, inverse, make_solution
@@ -78,17 +78,15 @@ def check_limits(
         # a bound itself is allowed, up to the rounding of its own number
         outside = ~(limit.margin >= -1e-12 * max(abs(limit.low), abs(limit.high)))
         for row in zip(*np.nonzero(outside & allowed), strict=True):
-            findings[row] = _report_exceeded(robot, limit, float(limit.value[row]))
+            value, low, high = (
+                robot.to_quantity(float(number), limit.dimension)
+                for number in (limit.value[row], limit.low, limit.high)
+            )
+            findings[row] = report_finding(
+                "limits.exceeded", name=limit.name, value=value, low=low, high=high
+            )
         allowed &= ~outside
     return allowed, findings
-
-
-def _report_exceeded(robot: Mechanism, limit: Limit, reached: float) -> Finding:
-    """Return the finding of an exceeded limit, in the robot's display unit."""
-    value, low, high = (
-        robot.to_quantity(number, limit.dimension) for number in (reached, limit.low, limit.high)
-    )
-    return report_finding("limits.exceeded", name=limit.name, value=value, low=low, high=high)
 
 
 def _evaluate_cones(robot: Mechanism, values: FloatArray, state: State) -> list[Limit]:

@@ -83,7 +83,7 @@ def place_platforms(target: Target) -> FloatArray:
     for axis, column in enumerate(target.columns[:3]):
         if column >= 0:
             T[..., axis, 3] = values[..., column]
-    if target.has_turns:
+    if max(target.columns[3:]) >= 0:
         T[..., :3, :3] = np.moveaxis(_compute_rotations(target), (0, 1), (-2, -1))
     return T
 
