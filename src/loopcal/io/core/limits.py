@@ -302,9 +302,11 @@ def find_fault(name: str, longest: int = LONGEST_NAME, is_text: bool = False) ->
     """
     what, length, facts = "text" if is_text else "name", len(name), dict[str, Any]()
     if (character := find_not_plain(name, "\n\t" if is_text else "")) is not None:
-        code, facts = "files.name-not-plain", {"what": what, "character": name_character(character)}
+        code = "files.name-not-plain"
+        facts |= {"what": what, "character": name_character(character)}
     elif length > longest:
-        code, facts = "files.name-too-long", {"what": what, "length": length, "longest": longest}
+        code = "files.name-too-long"
+        facts |= {"what": what, "length": length, "longest": longest}
     elif is_formula(name) and not is_text:
         code = "files.name-computed"
     else:
