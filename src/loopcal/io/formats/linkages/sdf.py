@@ -235,7 +235,13 @@ def read_tree(path: Path) -> LinkTree:
     closing = [joint for joint in joints if joint not in carried]
     tree = [part for joint in carried for part in _carry(joint, drawn)]
     followed = {j.name: _read_mimic(e) for j in carried if (e := j.element.find("axis", "mimic"))}
-    followed |= dict(_read_gearbox(joint, carried) for joint in geared)
+    by_child = {joint.child: joint.name for joint in carried}
+    for gear in geared:
+        if gear.parent not in by_child or gear.child not in by_child:
+            raise gear.element.error(f"gearbox {gear.name!r} joins links that no joint carries")
+        stated = gear.element.find("gearbox_ratio")
+        ratio = 1.0 if stated is None else stated.parse_number(stated.text, "ratio")
+        followed[by_child[gear.child]] = by_child[gear.parent], -ratio, 0.0
     tree = [replace(joint, mimic=followed.get(joint.name)) for joint in tree]
     frame_links = [joint.child for joint in tree if joint.child not in drawn]
     constraints = [joint.close(drawn) for joint in closing]
@@ -272,21 +278,6 @@ def _carry(joint: SdfJoint, drawn: Mapping[str, FloatArray]) -> tuple[TreeJoint,
 def _place_in_child(frames: Frames, element: Element) -> FloatArray:
     """Return the frame (4, 4) of a joint in its child link."""
     return geometry.invert_pose(frames.place(element.get("child"))) @ frames.place_element(element)
-
-
-def _read_gearbox(
-    gear: SdfJoint, carried: Sequence[SdfJoint]
-) -> tuple[str, tuple[str, float, float]]:
-    """Return the joint of the child of a gearbox, and what it follows."""
-    driver, driven = (
-        next((joint for joint in carried if joint.child == link), None)
-        for link in (gear.parent, gear.child)
-    )
-    if driver is None or driven is None:
-        raise gear.element.error(f"gearbox {gear.name!r} joins links that no joint carries")
-    element = gear.element.find("gearbox_ratio")
-    ratio = 1.0 if element is None else element.parse_number(element.text, "ratio")
-    return driven.name, (driver.name, -ratio, 0.0)
 
 
 def _read_mimic(mimic: Element) -> tuple[str, float, float]:
