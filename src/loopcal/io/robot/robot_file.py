@@ -423,11 +423,21 @@ def list_keys(record: type) -> tuple[Key, ...]:
 
 
 def collect_meanings(record: type) -> dict[str, str]:
-    """Return name -> phrase from the docstrings of a record and of its bases."""
+    """Return name -> phrase from the Attributes and Parameters sections of the docstrings of a
+    record and of its bases, from entries `name : phrase`, of which several may share a line.
+    Phrases that only point elsewhere are left out.
+    """
     meanings: dict[str, str] = {}
     for base in reversed(record.__mro__):
-        meanings |= _parse_entries(inspect.cleandoc(base.__doc__ or ""))
-    return {name.removesuffix("_"): phrase for name, phrase in meanings.items()}
+        titles_and_bodies = SECTION.split(inspect.cleandoc(base.__doc__ or ""))
+        sections = zip(titles_and_bodies[1::2], titles_and_bodies[2::2], strict=True)
+        text = "".join(body for title, body in sections if title in ("Attributes", "Parameters"))
+        _, *names_and_phrases = SHORT.split(text)
+        for names, written in zip(names_and_phrases[::2], names_and_phrases[1::2], strict=True):
+            phrase = ELSEWHERE.sub("", SI.sub("", " ".join(written.split()))).rstrip(". ")
+            named = (name.removesuffix("_") for name in names.split(", "))
+            meanings |= dict.fromkeys(named, phrase) if phrase else {}
+    return meanings
 
 
 def name_record(record: type) -> str:
@@ -459,21 +469,6 @@ def describe_type(annotation: Any) -> str:
         return name_record(annotation)
     names = {str: "text", float: "number", int: "whole number", bool: "true or false"}
     return "anything" if annotation is Any else names.get(annotation, str(annotation))
-
-
-def _parse_entries(doc: str) -> dict[str, str]:
-    """Return name -> phrase of the Attributes and Parameters sections of a docstring, from entries
-    `name : phrase`, of which several may share a line. Phrases that only point elsewhere are empty.
-    """
-    titles_and_bodies = SECTION.split(doc)
-    sections = zip(titles_and_bodies[1::2], titles_and_bodies[2::2], strict=True)
-    text = "".join(body for title, body in sections if title in ("Attributes", "Parameters"))
-    _, *names_and_phrases = SHORT.split(text)
-    entries: dict[str, str] = {}
-    for names, written in zip(names_and_phrases[::2], names_and_phrases[1::2], strict=True):
-        phrase = ELSEWHERE.sub("", SI.sub("", " ".join(written.split()))).rstrip(". ")
-        entries |= dict.fromkeys(names.split(", "), phrase) if phrase else {}
-    return entries
 
 
 def _describe_default(field: dataclasses.Field[Any]) -> str:

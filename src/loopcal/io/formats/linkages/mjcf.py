@@ -187,6 +187,17 @@ class _Reader:
             texts = stated.get("pos", "0 0 0"), stated.get("axis", "0 0 1")
             center = joint.parse_numbers(texts[0], 3, f"pos of joint {name!r}")
             axis = joint.parse_direction(texts[1], f"joint {name!r}")
+            reference, limits = joint.parse_number(stated.get("ref", "0"), "ref"), None
+            if reference and kind != "ball":
+                turned = self.parse_angle(reference) if kind == "hinge" else reference
+                self.references[stated.get("name", "")] = turned
+            limited = stated.get("limited", "auto")
+            is_limited = self.limited if limited == "auto" else limited != "false"
+            if "range" in stated and is_limited and kind != "ball":
+                low, high = joint.parse_numbers(stated["range"], 2, "range") - reference
+                if kind == "hinge":
+                    low, high = self.parse_angle(low), self.parse_angle(high)
+                limits = (float(low), float(high)) if low < high else None
             place = geometry.make_pose(np.eye(3), center)
             link = f"{body} at {name}"
             where = element.attributes
@@ -201,7 +212,7 @@ class _Reader:
                     link,
                     origin @ place,
                     axis,
-                    self._read_limits(joint, stated, KINDS[kind]),
+                    limits,
                     joint.line,
                     joint,
                     rounding=rounding,
@@ -215,25 +226,6 @@ class _Reader:
             line, what = element.line, f"{body} frame"
             self.joints.append(TreeJoint(what, "", carrier, body, origin, x, None, line))
         self.joints += moving
-
-    def _read_limits(
-        self, joint: Element, stated: Mapping[str, str], kind: str
-    ) -> tuple[float, float] | None:
-        """Return the range of a joint from its drawn pose [rad, m], None without."""
-        reference = joint.parse_number(stated.get("ref", "0"), "ref")
-        turns = kind == "R"
-        if reference and kind != "S":
-            value = self.parse_angle(reference) if turns else reference
-            self.references[stated.get("name", "")] = value
-        limited = stated.get("limited", "auto")
-        if "range" not in stated or limited == "false" or kind == "S":
-            return None
-        if limited == "auto" and not self.limited:
-            return None
-        low, high = joint.parse_numbers(stated["range"], 2, "range") - reference
-        if turns:
-            low, high = self.parse_angle(low), self.parse_angle(high)
-        return (float(low), float(high)) if low < high else None
 
 
 def _include(root: Element, path: Path) -> Element:
