@@ -351,10 +351,16 @@ def examine_picture(task: PictureTask) -> Picture:
     blur = measure_blur(cv2, gray, task.board, corners, pixels)
     least, fault = min(LEAST_CORNERS, task.board.corners[0] * task.board.corners[1]), None
     if len(corners) < least:
+        # in reduced pictures blur is less
+        reduced = (
+            cv2.resize(gray, (size[0] // n, size[1] // n), interpolation=cv2.INTER_AREA)
+            for n in REDUCED
+            if min(size) >= n
+        )
         flipped = np.ascontiguousarray(gray[:, ::-1])
         if len(find_corners(cv2, flipped, task.board)[0]) >= least:
             fault = report_finding("pictures.mirrored")
-        elif _shows_reduced(cv2, gray, task.board, len(corners)):
+        elif any(len(find_corners(cv2, r, task.board)[0]) > len(corners) for r in reduced):
             fault = report_finding("pictures.blurred", blur=None, limit=task.most_blur)
         else:
             fault = report_finding("pictures.few-corners", found=len(corners), least=least)
@@ -367,16 +373,6 @@ def examine_picture(task: PictureTask) -> Picture:
         cv2.circle(small, (round(u), round(v)), 4, (0, 90, 230), 1, cv2.LINE_AA)
     thumbnail = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, 75])[1].tobytes()
     return Picture(task.path, size, focal, corners, pixels, blur, fault, thumbnail)
-
-
-def _shows_reduced(cv2: Any, gray: Any, board: Board, count: int) -> bool:
-    """Return whether a reduced picture, in which blur is less, shows more corners than `count`."""
-    for factor in REDUCED:
-        size = gray.shape[1] // factor, gray.shape[0] // factor
-        small = cv2.resize(gray, size, interpolation=cv2.INTER_AREA) if min(size) else gray
-        if len(find_corners(cv2, small, board)[0]) > count:
-            return True
-    return False
 
 
 def _load_picture(path: Path) -> tuple[np.ndarray[Any, np.dtype[np.uint8]], float | None]:

@@ -468,12 +468,10 @@ def _parse_number(text: str, profile: Profile, name: str) -> str:
     """Return a finite number with a decimal point and its own digits; "" where it is missing."""
     if not text or text in profile.missing:
         return ""
-    value = profile.parse(text)
-    if value in profile.missing_numbers:
-        return ""
-    if value is None:
+    if (value := profile.parse(text)) is None:
         raise Misfit(f"{quote(text)} is not a number for {name!r}")
-    return profile.with_point(text)
+    is_missing = any(profile.parse(number) == value for number in profile.missing)
+    return "" if is_missing else profile.with_point(text)
 
 
 def _scale_sigma(text: str, source: ColumnSource, name: str) -> str:

@@ -300,12 +300,6 @@ class Profile:
         cells = self.record.missing
         return tuple(str(c) for c in (cells if isinstance(cells, tuple) else (cells,)))
 
-    @cached_property
-    def missing_numbers(self) -> tuple[float, ...]:
-        """Numbers that mean not measured."""
-        numbers = (self.parse(text) for text in self.missing)
-        return tuple(number for number in numbers if number is not None)
-
     @property
     def measured(self) -> tuple[str, ...]:
         """The columns of the kind, each once without its target; none for readings alone."""

@@ -448,11 +448,13 @@ def _describe_covariance(
         return []
     stated = [parameters[i]["si:real"] for i in kept]
     units = [real["si:unit"] for real in stated]
+    products = {(a, b): f"{a}{b}".replace(r"\one", "") for a in units for b in units}
+    products |= {(a, a): a if a == r"\one" else rf"{a}\tothe{{2}}" for a in units}
     columns = [
         {
             "si:covarianceXMLList": {
                 "si:valueXMLList": " ".join(f"{x:.10g}" for x in covariance[kept, k]),
-                "si:unitXMLList": " ".join(_multiply_units(unit, units[j]) for unit in units),
+                "si:unitXMLList": " ".join(products[unit, units[j]] for unit in units),
             }
         }
         for j, k in enumerate(kept)
@@ -470,13 +472,6 @@ def _describe_covariance(
         "si:measurementUncertaintyMultivariateXMLList": {"si:ellipsoidalRegionMUXMLList": region},
     }
     return [{"name": "Covariance of the identified parameters", "si:realListXMLList": values}]
-
-
-def _multiply_units(first: str, second: str) -> str:
-    """Return the product of two units in the D-SI."""
-    if first == second:
-        return first if first == r"\one" else rf"{first}\tothe{{2}}"
-    return f"{first}{second}".replace(r"\one", "")
 
 
 def _quantity(

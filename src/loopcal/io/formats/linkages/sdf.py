@@ -234,7 +234,15 @@ def read_tree(path: Path) -> LinkTree:
         reached.add(ready[0].child)
     closing = [joint for joint in joints if joint not in carried]
     tree = [part for joint in carried for part in _carry(joint, drawn)]
-    followed = {j.name: _read_mimic(e) for j in carried if (e := j.element.find("axis", "mimic"))}
+    followed: dict[str, tuple[str, float, float]] = {}  # joint -> another one, factor and offset
+    for joint in carried:
+        if (mimic := joint.element.find("axis", "mimic")) is not None:
+            factor, offset, reference = (
+                mimic.parse_number(mimic.get(key) or default, key)
+                for key, default in (("multiplier", "1"), ("offset", "0"), ("reference", "0"))
+            )
+            leader = mimic.attributes.get("joint", "")
+            followed[joint.name] = leader, factor, offset - factor * reference
     by_child = {joint.child: joint.name for joint in carried}
     for gear in geared:
         if gear.parent not in by_child or gear.child not in by_child:
@@ -278,15 +286,6 @@ def _carry(joint: SdfJoint, drawn: Mapping[str, FloatArray]) -> tuple[TreeJoint,
 def _place_in_child(frames: Frames, element: Element) -> FloatArray:
     """Return the frame (4, 4) of a joint in its child link."""
     return geometry.invert_pose(frames.place(element.get("child"))) @ frames.place_element(element)
-
-
-def _read_mimic(mimic: Element) -> tuple[str, float, float]:
-    """Return the joint that is followed, factor and offset."""
-    factor, offset, reference = (
-        mimic.parse_number(mimic.get(key) or default, key)
-        for key, default in (("multiplier", "1"), ("offset", "0"), ("reference", "0"))
-    )
-    return mimic.attributes.get("joint", ""), factor, offset - factor * reference
 
 
 def rewrite(tree: LinkTree, other: LinkTree) -> str:
