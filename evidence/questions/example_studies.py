@@ -12,9 +12,9 @@ from typing import Any
 
 import loopcal
 from loopcal.report.pictures import render_figure
+from loopcal.report.words import say
 from loopcal.results.tables import Table
 from loopcal.studies.study_result import (
-    FRAMES,
     AnsweredQuestion,
     CellSummary,
     Interval,
@@ -69,7 +69,7 @@ def describe_results(result: StudyResult, shown: Shown) -> dict[str, Any]:
     return {
         "seed": study.seed,
         "replicates": study.replicates,
-        "frame": FRAMES[study.scores.frame],
+        "frame": say(f"study.frame-{study.scores.frame}"),
         "cells": [_describe_cell(cell, scores) for cell in summary.cells],
         "questions": [_describe_answers(item) for item in answered],
         "tables": tables,
