@@ -138,9 +138,19 @@ def solve_at_pose(
 def differentiate_at_pose(
     robot: Mechanism, values: FloatArray, q: FloatArray, state: State
 ) -> PoseDrivenSensitivity:
-    """Differentiate readings and passive joints of redundant actuators at states (t, n)."""
+    """Differentiate readings and passive joints of redundant actuators at states (t, n). Of limbs
+    with one drive and one closure row each, driven joints move by -(E de + A dy) / Q.
+    """
     p, m = len(robot.parameters), len(robot.freedoms)
-    joints = _differentiate_joints_at_pose(robot, values, state)
+    displacements = differentiate_displacements(robot, values)
+    joints = np.zeros((*state.T.shape[:2], robot.program.n_joints, p + m))
+    for rows, blocks in linearize_limbs(robot, values, state):
+        own = select_block(displacements, rows[:1])
+        for limb in divide_limbs(robot.program, blocks):
+            by_parameters = np.matmul(limb.E, own[:, None, limb.slots])
+            both = np.concatenate([by_parameters, limb.A], axis=3)
+            with np.errstate(all="ignore"):
+                joints[rows][:, :, limb.drives] = -(both / limb.Q)
     twists = np.broadcast_to(np.eye(m, p + m, p), (*joints.shape[:2], m, p + m))
     passive = move_passive_joints(robot, values, state, twists, joints)
     by_inputs = differentiate_transmissions(robot, values, q)
@@ -152,23 +162,6 @@ def differentiate_at_pose(
         (readings[..., :p], readings[..., p:]),
         (passive[..., :p], passive[..., p:]),
     )
-
-
-def _differentiate_joints_at_pose(robot: Mechanism, values: FloatArray, state: State) -> FloatArray:
-    """Return the derivatives (t, n, J, p + m) of driven joints by parameters at constant pose, and
-    by the m freedoms: -(E de + A dy) / Q, of limbs with one drive and one closure row each.
-    """
-    p, m = len(robot.parameters), len(robot.freedoms)
-    displacements = differentiate_displacements(robot, values)
-    out = np.zeros((*state.T.shape[:2], robot.program.n_joints, p + m))
-    for rows, blocks in linearize_limbs(robot, values, state):
-        own = select_block(displacements, rows[:1])
-        for limb in divide_limbs(robot.program, blocks):
-            by_parameters = np.matmul(limb.E, own[:, None, limb.slots])
-            both = np.concatenate([by_parameters, limb.A], axis=3)
-            with np.errstate(all="ignore"):
-                out[rows][:, :, limb.drives] = -(both / limb.Q)
-    return out
 
 
 # Driven joints l whose sums are given, s(q) = W l, where the sums of readings and of couplings
