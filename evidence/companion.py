@@ -19,6 +19,7 @@ from loopcal.apply.simulated_measurements import (
     build_instrument,
     fill_in_measurements,
 )
+from loopcal.geometry import exp_so3, make_pose
 from loopcal.io.robot.robot_file import load_robot
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations
@@ -31,6 +32,8 @@ MACHINES, WRONG, SIGMAS = 100, 0.1, 6.0
 """Sessions of each case, share of suggested rows that are wrong, and by how much."""
 
 DOUBTED = ("repeat", "differ")
+PLACE = make_pose(exp_so3(np.array([1.1, -0.6, 2.2])), np.array([2.5, -1.3, 0.7]))
+"""Frame of an instrument at an unknown place [m]."""
 
 
 @dataclass(frozen=True)
@@ -86,8 +89,10 @@ class Session:
         drawn = fill_in_measurements(
             self.robot, self.planned, self.exact, draw_errors=True, seed=seed
         )
-        free = self.task.problem.free
-        return drawn.data.observations[0].measured, free.deviation(drawn.truth.values[None])[0]
+        free, exact = self.task.problem.free, drawn.data.observations[0].measured
+        if self.case.frames:
+            exact = exact @ PLACE[:3, :3].T + PLACE[:3, 3]
+        return exact, free.deviation(drawn.truth.values[None])[0]
 
     def to_visits(self, poses: list[int], values: list[FloatArray]) -> Measurements:
         """Return visits of poses with their measured values [m]."""

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import loopcal as lc
+from loopcal import geometry
 from loopcal.apply.simulated_measurements import (
     InstrumentDescription,
     build_instrument,
@@ -24,6 +25,8 @@ from loopcal.planning.constraints import PlanOptions, restore_options
 from loopcal.planning.pose_planning import plan
 
 SIGMA = 5e-6
+# Place of an instrument whose frame is unknown [m].
+PLACE = geometry.make_pose(geometry.exp_so3(np.array([1.1, -0.6, 2.2])), np.array([2.5, -1.3, 0.7]))
 Wrong = Mapping[int, Sequence[float]]
 
 
@@ -31,7 +34,7 @@ class Machine:
     """A plan for a robot, and a true machine whose poses are measured as often as one likes."""
 
     def __init__(self, name: str, frames: tuple[str, ...], seed: int, **options: float) -> None:
-        self.robot = lc.load_robot(name)
+        self.robot, self.is_framed = lc.load_robot(name), bool(frames)
         description = InstrumentDescription(
             ("position",), sigma_position=SIGMA, unknown_frames=frames
         )
@@ -54,8 +57,11 @@ class Machine:
     def measure(self, poses: Sequence[int], wrong: Wrong | None = None) -> Measurements:
         """Return visits of poses, each with noise of its own; `wrong` rows are moved [m]."""
         (observed,), n = self.exact.observations, len(poses)
+        exact = observed.measured
+        if self.is_framed:
+            exact = exact @ PLACE[:3, :3].T + PLACE[:3, 3]
         noise = [np.random.default_rng([7, i]).normal(size=3) for i in range(n)]
-        values = observed.measured[list(poses)] + SIGMA * np.array(noise)
+        values = exact[list(poses)] + SIGMA * np.array(noise)
         for i, error in (wrong or {}).items():
             if i < n:
                 values[i] += error
@@ -166,6 +172,13 @@ def test_rows_that_contradict_each_other_are_measured_again() -> None:
     state, verdicts = follow(machine, [*machine.fit[:7], machine.fit[6]], wrong)
     assert verdicts[-1].judgement == "differ"
     assert co.choose_next(state).pose == machine.fit[6]
+
+
+def test_rows_on_one_line_and_repeated_points_leave_a_far_frame_open_but_fit() -> None:
+    machine = make_machine(("base",))
+    first, second, *others = machine.fit[:5]
+    found = judge(machine, [first, first, second, first, *others])
+    assert found == ["untestable", *["fits"] * 6]
 
 
 def test_a_wrong_row_before_anything_could_be_tested_is_found_later() -> None:

@@ -22,6 +22,7 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Literal, NamedTuple
@@ -69,6 +70,8 @@ OPEN = 1e-6
 # are not linear.
 FAR = 0.1
 STEPS = 20  # of the iteration to the estimate
+# Share of the sum of squares by which a further step would lower it where the setup is not found.
+UNSETTLED = 0.01
 SETTLED = 1e-6  # squared length [standard deviations] of a step at which it ends
 # Difference of sums of squares up to which another row may be the wrong one, and the largest number
 # of such rows that is named.
@@ -201,6 +204,11 @@ class VisitFit:
         return not self.solution.open[np.isfinite(self.unit)].any()
 
     @property
+    def is_settled(self) -> bool:
+        """Whether the iteration came to a minimum."""
+        return self.cost - self.solution.cost < UNSETTLED * (1.0 + self.solution.cost)
+
+    @property
     def scale(self) -> tuple[float, float]:
         """Noise in units of the stated one, and its degrees of freedom: 1 and infinity unless the
         rows contradict the stated noise and tolerances.
@@ -274,13 +282,9 @@ def fit_visits(
     """
     best = linearize_visits(task, measured, used, None if start is None else start.x)
     if (start is None or not start.is_located) and used.any():
-        chosen, (setup, z) = measured.take(used), np.split(best.x, [-len(task.problem.free)])
-        free = task.problem.free
-        robot = free.robot.with_values(free.values(z[None])[0])
-        T = observe_poses(replace(free, robot=robot), chosen.readings).T
-        values = [rows.measured[None] for rows in chosen.observations]
-        setup = guess_nuisance_values_batch(chosen, values, T, chosen.nuisance_parameters)[0]
-        best = linearize_visits(task, measured, used, np.append(setup, z))
+        best = linearize_visits(
+            task, measured, used, _locate_setup(task, measured.take(used), best.x)
+        )
     share = 1.0
     for _ in range(STEPS):
         if best.cost - best.solution.cost < SETTLED:
@@ -288,6 +292,20 @@ def fit_visits(
         after = linearize_visits(task, measured, used, best.x + share * best.solution.step)
         best, share = (after, 1.0) if after.cost < best.cost else (best, 0.5 * share)
     return best
+
+
+def _locate_setup(task: CompanionTask, measured: Measurements, x: FloatArray) -> FloatArray:
+    """Return x (k,) with the setup that fits visits best at its machine."""
+    free, z = task.problem.free, x[len(x) - len(task.problem.free) :]
+    free = replace(free, robot=free.robot.with_values(free.values(z[None])[0]))
+    (observed,), nuisance = measured.observations, measured.nuisance_parameters
+    distance = np.linalg.norm(np.nan_to_num(observed.measured - observed.measured[0]), axis=1)
+    for chosen in (measured, measured.take(np.unique([0, distance.argmax()]))):
+        T = observe_poses(free, chosen.readings).T
+        values = [rows.measured[None] for rows in chosen.observations]
+        with suppress(DataError):  # all points on one line, of which two are enough
+            return np.append(guess_nuisance_values_batch(chosen, values, T, nuisance)[0], z)
+    return x
 
 
 # What a new row says.
@@ -366,11 +384,16 @@ def examine_row(before: Companion, measured: Measurements, pose: int) -> Verdict
     used = np.append(before.is_used, False)
     fitted = used & ~task.is_held_out[list(poses)]
     fit = linearize_visits(task, measured, fitted, None if before.fit is None else before.fit.x)
+    is_settled = True
     if not fit.is_located:  # the new row locates the setup, too
         joined = fit_visits(task, measured, fitted | is_new, before.fit)
         fit = linearize_visits(task, measured, fitted, joined.x)
+        is_settled = joined.is_settled
     expected = observe_visits(task, measured, fit.x + fit.solution.step).expected[-1]
     prediction, rows = predict_visit(measured, fit, n - 1), fit.rows
+    if not is_settled:  # the setup is somewhere else
+        unknown = np.full_like(prediction.sd, np.inf)
+        prediction = prediction._replace(sd=unknown, distance=0.0, degrees=0, p_value=1.0)
     data = {"pose": task.labels[pose], **_describe_worst(task.robot, measured, prediction)}
     same = [i for i in range(n - 1) if poses[i] == pose]
     doubted = [i for i in same if not used[i]]
@@ -393,7 +416,7 @@ def examine_row(before: Companion, measured: Measurements, pose: int) -> Verdict
             return conclude_drift(earlier[0])
         if prediction.degrees == 0:
             names = measured.nuisance_parameters.table.names
-            is_open = fit.solution.open[: len(names)].any(axis=1)
+            is_open = fit.solution.open[: len(names)].any(axis=1) | (not is_settled)
             return conclude("untestable", setup=tuple(names[i] for i in np.flatnonzero(is_open)))
         return conclude("fits", earlier=len(doubted))
     agreeing = [i for i in same if compare_visits(rows, i, n - 1, fit.scale) >= LEVEL]

@@ -305,9 +305,10 @@ class Position(TargetKind):
                 raise guess
             return guess
         moving, origin, points, positions = self.collect_points(T, measured)
-        if not self.unknown or len(positions) < 3:
+        is_framed = "frame" in self.unknown and len(positions) > 0
+        if not self.unknown or (len(positions) < 3 and not is_framed):
             return self.nominal_values[None]
-        if "frame" in self.unknown:
+        if "frame" in self.unknown and len(positions) > 2:  # two leave a rotation open
             self._check_extent(positions)
         if "targets" not in self.unknown:
             return setup.encode_frame(self.T_base_frame, align_point_sets(positions, points))[None]
