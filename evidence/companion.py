@@ -136,7 +136,7 @@ class Session:
             state = co.take_rows(self.task, measured, poses, verdict.is_used, state)
         assert state.fit is not None
         prediction = self.task.problem.prediction
-        change = prediction.position @ (state.fit.deviation - truth)
+        change = prediction.position @ (state.fit.x[-len(truth) :] - truth)
         error = float(np.linalg.norm(change) / np.sqrt(len(prediction)))
         return {**counts, "rows": len(poses), "error": error, "used": int(state.is_used.sum())}
 
