@@ -106,10 +106,15 @@ def _list_motors(part: Element) -> Iterator[tuple[str, int]]:
             yield joint.attributes.get("name", ""), joint.line
 
 
+def _find(element: Element, name: str) -> Element | None:
+    """Return the last child of a name, None without."""
+    return next(reversed([*element.find_all(name)]), None)
+
+
 def _get_attributes(element: Element, name: str) -> Mapping[str, str]:
     """Return the attributes of the last child of a name, empty without."""
-    found = [*element.find_all(name)]
-    return found[-1].attributes if found else {}
+    found = _find(element, name)
+    return {} if found is None else found.attributes
 
 
 def _build_joint(element: Element) -> TreeJoint:
@@ -121,7 +126,8 @@ def _build_joint(element: Element) -> TreeJoint:
     parent, child = _get_links(element)
     kind, limit = KINDS[stated], _get_attributes(element, "limit")
     what = f"joint {name!r}"
-    T = _parse_origin(element, _get_attributes(element, "origin"), what)
+    place, direction = _find(element, "origin"), _get_attributes(element, "axis").get("xyz", "")
+    T, rounding = _read_place(element, place, what, direction)
     axis = _parse_axis(element, "axis", what) if kind else np.eye(3)[0]
     limits = None
     if kind and stated != "continuous" and {"lower", "upper"} <= limit.keys():
@@ -137,8 +143,6 @@ def _build_joint(element: Element) -> TreeJoint:
             for key, default in (("multiplier", "1"), ("offset", "0"))
         )
         followed = mimic.get("joint", ""), factor, offset
-    rounding = _measure_rounding(element, "origin", "axis")
-    place = element.find("origin")
     return TreeJoint(
         name, kind, parent, child, T, axis, limits, element.line, place, followed, rounding
     )
@@ -152,18 +156,12 @@ def _build_constraint(element: Element) -> Constraint:
         sentence = f"{what} is of type {stated!r}. Allowed: {', '.join(CONSTRAINTS)}"
         raise element.error(sentence)
     kind = CONSTRAINTS[stated.lower()]
-    first, second = (
-        make_end(
-            name,
-            end,
-            link,
-            _parse_origin(element, _get_attributes(element, f"{end}_origin"), what),
-            element.line,
-            element.find(f"{end}_origin"),
-            _measure_rounding(element, f"{end}_origin", f"{end}_axis"),
-        )
-        for end, link in zip(("parent", "child"), _get_links(element), strict=True)
-    )
+    ends = []
+    for end, link in zip(("parent", "child"), _get_links(element), strict=True):
+        place = _find(element, f"{end}_origin")
+        direction = _get_attributes(element, f"{end}_axis").get("xyz", "")
+        T, rounding = _read_place(element, place, what, direction)
+        ends.append(make_end(name, end, link, T, element.line, place, rounding))
     given = [end for end in ("parent", "child") if element.find(f"{end}_axis") is not None]
     needed = {"R": ["parent"], "P": ["parent"], "U": ["parent", "child"]}.get(kind, [])
     if missing := [end for end in needed if end not in given]:
@@ -179,7 +177,8 @@ def _build_constraint(element: Element) -> Constraint:
             sentence = f"{what} is {stated}, but its child_axis is not its parent_axis"
             action = "turn child_origin so that both frames share the axis, or leave child_axis out"
             raise element.error(f"{sentence}; {action}")
-    return Constraint(name, kind, (first, second), (axes["parent"], axes["child"]), element.line)
+    both = axes["parent"], axes["child"]
+    return Constraint(name, kind, (ends[0], ends[1]), both, element.line)
 
 
 def _build_loop(element: Element) -> Constraint:
@@ -189,28 +188,12 @@ def _build_loop(element: Element) -> Constraint:
     if kind not in CONSTRAINTS or CONSTRAINTS[kind] == "U" or len(links) != 2:
         finding = report_finding("files.urdf-other-loop", element=f"{LOOP} type={kind!r}")
         raise element.error(finding)
-    first, second = (
-        make_end(
-            name,
-            end,
-            link.attributes.get("link", ""),
-            _parse_origin(link, link.attributes, what),
-            link.line,
-            link,
-            measure_rounding([link.attributes.get("xyz", "")], [link.attributes.get("rpy", "")]),
-        )
-        for end, link in zip(("parent", "child"), links, strict=True)
-    )
+    ends = []
+    for end, link in zip(("parent", "child"), links, strict=True):
+        (T, rounding), body = _read_place(link, link, what), link.attributes.get("link", "")
+        ends.append(make_end(name, end, body, T, link.line, link, rounding))
     axis = _parse_axis(element, "axis", what)
-    return Constraint(name, CONSTRAINTS[kind], (first, second), (axis, axis), element.line)
-
-
-def _measure_rounding(element: Element, origin: str, axis: str) -> tuple[float, float]:
-    """Return the rounding errors of an origin and an axis [m, rad]."""
-    place, direction = _get_attributes(element, origin), _get_attributes(element, axis)
-    return measure_rounding(
-        [place.get("xyz", "")], [place.get("rpy", ""), direction.get("xyz", "")]
-    )
+    return Constraint(name, CONSTRAINTS[kind], (ends[0], ends[1]), (axis, axis), element.line)
 
 
 def _get_links(element: Element) -> tuple[str, str]:
@@ -223,11 +206,17 @@ def _get_links(element: Element) -> tuple[str, str]:
     return parent, child
 
 
-def _parse_origin(element: Element, origin: Mapping[str, str], what: str) -> FloatArray:
-    """Return an origin as (4, 4)."""
-    xyz = element.parse_numbers(origin.get("xyz", "0 0 0"), 3, f"xyz of {what}")
-    rpy = element.parse_numbers(origin.get("rpy", "0 0 0"), 3, f"rpy of {what}")
-    return geometry.make_pose(geometry.euler_to_matrix(rpy, "xyz"), xyz)
+def _read_place(
+    element: Element, place: Element | None, what: str, axis: str = ""
+) -> tuple[FloatArray, tuple[float, float]]:
+    """Return the origin (4, 4) that a place in an element states, the identity without, and the
+    rounding errors of this origin and an axis [m, rad].
+    """
+    stated = {} if place is None else place.attributes
+    xyz = element.parse_numbers(stated.get("xyz", "0 0 0"), 3, f"xyz of {what}")
+    rpy = element.parse_numbers(stated.get("rpy", "0 0 0"), 3, f"rpy of {what}")
+    rounding = measure_rounding([stated.get("xyz", "")], [stated.get("rpy", ""), axis])
+    return geometry.make_pose(geometry.euler_to_matrix(rpy, "xyz"), xyz), rounding
 
 
 def _parse_axis(element: Element, name: str, what: str) -> FloatArray:
