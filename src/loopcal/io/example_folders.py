@@ -32,28 +32,18 @@ def describe_example(folder: Path) -> str:
     return text.splitlines()[0].lstrip("# ").strip()
 
 
-def list_example_files(name: str) -> Mapping[str, Path]:
-    """Return the files of an example by name.
-
-    DataError : `files.no-example`.
-    """
-    examples = list_examples()
-    if name not in examples:
-        similar = suggest_names(name, list(examples))
-        finding = report_finding(
-            "files.no-example", name=name, similar=similar, examples=tuple(examples)
-        )
-        raise DataError(finding)
-    return {path.name: path for path in sorted(examples[name].iterdir()) if path.is_file()}
-
-
 def write_example(name: str, path: str | Path) -> tuple[str, ...]:
     """Copy an example into a new folder; return the names of its files.
 
-    DataError, FileError : no such example; the folder exists, or cannot be written.
+    DataError, FileError : no such example (`files.no-example`); the folder exists, or cannot be
+    written.
     """
-    path = as_path(path, "folder")
-    files = list_example_files(name)
+    path, examples = as_path(path, "folder"), list_examples()
+    if name not in examples:
+        similar, known = suggest_names(name, list(examples)), tuple(examples)
+        finding = report_finding("files.no-example", name=name, similar=similar, examples=known)
+        raise DataError(finding)
+    files = {file.name: file for file in sorted(examples[name].iterdir()) if file.is_file()}
 
     def refuse_existing(target: Path) -> None:
         if target.exists() and (not target.is_dir() or any(target.iterdir())):

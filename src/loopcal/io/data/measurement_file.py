@@ -509,9 +509,8 @@ def load_contact_sheet(sheet: str | Path, plan: str | Path, robot: Mechanism) ->
     FileError, DataError : as `load_measurements`, or the plan lacks a pose of the sheet.
     """
     table, planned = read_table(sheet), read_table(plan)
-    readings = tuple(actuator.name for actuator in robot.actuators)
-    require_columns(planned, ("pose", *readings), f"a reading of {robot.name}")
-    kept = ("pose", *readings)
+    kept = ("pose", *(actuator.name for actuator in robot.actuators))
+    require_columns(planned, kept, f"a reading of {robot.name}")
     planned = replace(
         planned,
         units={name: planned.units[name] for name in kept},
