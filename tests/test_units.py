@@ -56,3 +56,18 @@ def test_every_unit_is_found_by_its_symbol() -> None:
         for symbol in list_symbols(dimension):
             assert find_unit(symbol, dimension).dimension is dimension
             assert str(find_unit(symbol)) == symbol
+
+
+@pytest.mark.parametrize(
+    ("text", "value", "difference"),
+    [("23 degC", 23.0, 23.0), ("296.15 K", 23.0, 296.15), ("73.4 degF", 23.0, 73.4 * 5 / 9)],
+)
+def test_a_temperature_has_an_offset_and_a_difference_has_none(text, value, difference) -> None:
+    assert parse_quantity(text, Dimension.TEMPERATURE) == pytest.approx(value, rel=1e-14)
+    found = parse_quantity(text, Dimension.TEMPERATURE, is_difference=True)
+    assert found == pytest.approx(difference, rel=1e-14)
+
+
+def test_a_temperature_below_absolute_zero_is_refused() -> None:
+    with pytest.raises(UnitError, match="-1 K is below absolute zero"):
+        parse_quantity("-1 K", Dimension.TEMPERATURE)

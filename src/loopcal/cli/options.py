@@ -797,7 +797,8 @@ def parse_reading_sigma(text: str | None, robot: lc.Mechanism) -> FloatArray | N
             )
         for actuator in (name,) if equals else tuple(sigma):
             try:
-                sigma[actuator] = parse_quantity(number, dimensions[actuator])
+                dimension = dimensions[actuator]
+                sigma[actuator] = parse_quantity(number, dimension, is_difference=True)
             except UnitError as error:
                 raise DataError(f"--sigma-reading {number!r} for {actuator}: {error}") from None
             if not 0.0 <= sigma[actuator] < np.inf:

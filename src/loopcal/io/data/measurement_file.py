@@ -439,7 +439,7 @@ def _read_reading_sigma(table: Table, robot: Mechanism, readings: FloatArray) ->
         entries = match_names(file, node, list(dimensions), (READING_NOISE,))
     for text, names, place in entries:
         for name in names:
-            stated[name] = file.quantity(text, dimensions[name], place)
+            stated[name] = file.quantity(text, dimensions[name], place, is_difference=True)
             if stated[name] != 0.0 and (fault := find_sd_fault(stated[name])):
                 sentence = f"the noise of readings is {text}; {fault}, or 0 for exact readings"
                 raise file.error(sentence, place)
