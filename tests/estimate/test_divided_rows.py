@@ -11,7 +11,8 @@ from numpy.testing import assert_allclose
 
 from benchmarks.bench_growth import draw_sessions
 from loopcal.diagnose.blunders import Predictor
-from loopcal.diagnose.residual_patterns import collect_residual_rows
+from loopcal.diagnose.residual_patterns import collect_residual_rows, estimate_correlated_errors
+from loopcal.diagnose.residual_patterns import test_correlation as compute_correlation
 from loopcal.estimate import pose_rows
 from loopcal.estimate.fit_linearization import collect_uncertainty, linearize_fit
 from loopcal.estimate.identification import identify
@@ -21,6 +22,7 @@ from loopcal.io.robot.robot_file import load_robot
 from loopcal.measure.kinds.distance import Distance, Separation
 from loopcal.measure.kinds.position import Bearing, Position, TargetKind
 from loopcal.measure.kinds.surfaces import Plane, Sphere
+from loopcal.numerics.split_columns import SplitColumns
 
 NAMES, PLACES = ("a", "b", "c"), np.array([[0.1, 0.0, 0.02], [-0.05, 0.08, 0.02], [0.0, -0.1, 0.0]])
 STATION = make_pose(exp_so3(np.array([0.1, -0.2, 0.7])), np.array([-1.2, 0.4, 0.3]))
@@ -116,3 +118,26 @@ def test_residuals_of_many_blocks_of_poses_keep_their_rows(monkeypatch) -> None:
     for name in ("kind", "row", "column", "series"):
         assert np.array_equal(getattr(whole, name), getattr(parts, name))
     assert_allclose(parts.residual, whole.residual, atol=1e-9)
+
+
+def test_residuals_of_sessions_are_examined_as_by_dense_columns() -> None:
+    robot = load_robot("hexapod-42")
+    data = draw_sessions(robot, 60, 5, 2)
+    rows = collect_residual_rows(linearize_fit(identify(robot, data), data))
+    assert rows is not None
+    assert rows.basis.narrow.shape[1] > 0
+    basis, gain = (SplitColumns.of(each.toarray()) for each in (rows.basis, rows.gain))
+    dense = replace(rows, basis=basis, gain=gain)
+    assert_allclose(compute_correlation(rows), compute_correlation(dense), rtol=1e-9)
+    one, other = (estimate_correlated_errors(each, 8.0) for each in (rows, dense))
+    size = np.abs(other.covariance).max()
+    assert_allclose(one.covariance, other.covariance, atol=1e-9 * size)
+    assert_allclose(
+        [one.degrees, one.correlation, one.sigma],
+        [other.degrees, other.correlation, other.sigma],
+        rtol=1e-9,
+    )
+    left = np.arange(0, 360, 7)
+    projectors = [each.without(left).basis.toarray() for each in (rows, dense)]
+    one, other = (P @ P.T for P in projectors)
+    assert_allclose(one, other, atol=1e-9)

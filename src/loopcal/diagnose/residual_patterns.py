@@ -16,7 +16,7 @@ Source: Durbin and Watson, Testing for serial correlation in least squares regre
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -577,6 +577,7 @@ RHO = (0.0, 0.2, 0.4, 0.55, 0.7, 0.8, 0.87, 0.92, 0.96, 0.98, 0.99)
 SHARE = (1.0, 0.75, 0.5, 0.3, 0.15)  # shares a of the correlated noise
 # Relative variance of the size of the covariance below which it counts as known.
 LEAST_SCATTER = 1e-9
+NO_WEIGHT = 1e-12  # share of a correlation that adds nothing to the average
 LONGEST = 400  # rows of a series whose correlation is considered at once; longer series are cut
 
 
@@ -600,53 +601,86 @@ def estimate_correlated_errors(rows: ResidualRows, sigma_degrees: float) -> Corr
     for first, last in zip(starts, np.r_[starts[1:], len(rows.series)], strict=True):
         for part in np.array_split(np.arange(first, last), -(-(last - first) // LONGEST)):
             by_length.setdefault(len(part), []).append(part)
-    segments = [np.array(segments) for segments in by_length.values()]
+    whole = rows.basis.append(rows.residual[:, None])
+    segments = [(n, [whole.localize(own) for own in parts]) for n, parts in by_length.items()]
+    gains = [(n, [rows.gain.localize(own) for own in parts]) for n, parts in by_length.items()]
     nu = rows.degrees + sigma_degrees
-    logs, scales, covariances, neighbors = [], [], [], []
-    for rho in RHO:
-        for share in SHARE if rho > 0.0 else (1.0,):
-            log_det, square, explained = _evaluate(rows, segments, rho, share)
-            scale = (sigma_degrees + square) / nu if np.isfinite(nu) else 1.0
-            by_size = nu * np.log(scale) if np.isfinite(nu) else square
-            logs.append(-0.5 * (log_det + by_size))
-            scales.append(scale)
-            covariances.append(scale * explained)
-            neighbors.append(share * rho)
+    tried = [(rho, share) for rho in RHO for share in (SHARE if rho > 0.0 else (1.0,))]
+    logs, scales = [], []
+    for rho, share in tried:
+        log_det, square = _evaluate(rows, segments, rho, share)
+        scale = (sigma_degrees + square) / nu if np.isfinite(nu) else 1.0
+        by_size = nu * np.log(scale) if np.isfinite(nu) else square
+        logs.append(-0.5 * (log_det + by_size))
+        scales.append(scale)
     weight = np.exp(np.array(logs) - max(logs))
     weight /= weight.sum()
-    covariance = np.einsum("i,ijk->jk", weight, np.array(covariances))
-    sizes = np.array([np.trace(c) for c in covariances])
+    k = rows.gain.shape[1]
+    covariance, sizes = np.zeros((k, k)), np.zeros(len(tried))
+    for i in np.flatnonzero(weight > NO_WEIGHT).tolist():
+        explained = scales[i] * _add_products(k, gains, lambda K, X: K.T @ X, *tried[i])
+        covariance += weight[i] * explained
+        sizes[i] = np.trace(explained)
     mean = float(weight @ sizes)
     # without a direction that the data determine there is no covariance, hence no scatter of it
     scatter = float(weight @ (sizes - mean) ** 2) / mean**2 if mean > 0.0 else 0.0
     return CorrelatedErrors(
         covariance,
         2.0 / max(scatter + 2.0 / nu, LEAST_SCATTER),
-        float(weight @ np.array(neighbors)),
+        float(weight @ [rho * share for rho, share in tried]),
         float(np.sqrt(weight @ np.array(scales))),
     )
 
 
+Segments = Sequence[tuple[int, Sequence[tuple[IntArray, FloatArray]]]]
+"""Runs of n neighbors: their columns (c,) and values (n, c), those of one n together."""
+
+
+def _factorize(n: int, rho: float, share: float) -> FloatArray:
+    """Return the Cholesky factor (n, n) of the covariance K of n neighbors."""
+    K = share * rho ** np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
+    K[np.diag_indices(n)] = 1.0
+    return np.asarray(np.linalg.cholesky(K), dtype=float)
+
+
+def _add_products(
+    count: int,
+    segments: Segments,
+    weigh: Callable[[FloatArray, FloatArray], FloatArray],
+    rho: float,
+    share: float,
+) -> FloatArray:
+    """Return the sum X'X (count, count) over segments, weighed by the factors of their K."""
+    total = np.zeros((count, count))
+    for n, parts in segments:
+        # one system for all segments: the triangle is the same for each
+        stacked = weigh(_factorize(n, rho, share), np.concatenate([X for _, X in parts], axis=1))
+        ends = np.cumsum([len(columns) for columns, _ in parts])[:-1]
+        for (columns, _), X in zip(parts, np.split(stacked, ends, axis=1), strict=True):
+            total[np.ix_(columns, columns)] += X.T @ X
+    return total
+
+
 def _evaluate(
-    rows: ResidualRows, segments: list[IntArray], rho: float, share: float
-) -> tuple[float, float, FloatArray]:
-    """Return log |K| + log |X'K^-1 X|, the sum of squares S, and G'K G (k, k)."""
+    rows: ResidualRows, segments: Segments, rho: float, share: float
+) -> tuple[float, float]:
+    """Return log |K| + log |X'K^-1 X|, X orthonormal, and the sum of squares S."""
     from scipy.linalg import solve_triangular
 
-    q, k = rows.basis.shape[1], rows.gain.shape[1]
-    columns, gain = np.column_stack([rows.basis.toarray(), rows.residual]), rows.gain.toarray()
-    log_det, white, spread = 0.0, [], np.zeros((k, k))
-    for members in segments:
-        count, n = members.shape
-        K = share * rho ** np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
-        K[np.diag_indices(n)] = 1.0
-        L = np.linalg.cholesky(K)
-        log_det += 2.0 * count * float(np.log(np.diag(L)).sum())
-        # one system for all segments: the triangle is the same for each
-        stacked = columns[members.T].reshape(n, count * (q + 1))
-        white.append(solve_triangular(L, stacked, lower=True).reshape(n * count, q + 1))
-        part = (L.T @ gain[members.T].reshape(n, count * k)).reshape(n * count, k)
-        spread += part.T @ part
-    R = np.asarray(np.linalg.qr(np.concatenate(white), mode="r"))
-    log_det += 2.0 * float(np.log(np.abs(np.diag(R)[:q])).sum())
-    return log_det, float(R[-1, -1] ** 2), spread
+    def whiten(L: FloatArray, X: FloatArray) -> FloatArray:
+        return np.asarray(solve_triangular(L, X, lower=True))
+
+    q, s = rows.basis.shape[1], rows.basis.narrow.shape[1]
+    inside, log_det = _add_products(q + 1, segments, whiten, rho, share), 0.0
+    for n, parts in segments:
+        log_det += 2.0 * len(parts) * float(np.log(np.diag(_factorize(n, rho, share))).sum())
+    if s:  # the columns of sessions are linked where these are neighbors
+        from scipy.sparse import csc_array
+        from scipy.sparse.linalg import splu
+
+        lu = splu(csc_array(inside[:s, :s]))
+        log_det += float(np.log(np.abs(lu.U.diagonal())).sum())
+        inside = inside[s:, s:] - inside[s:, :s] @ lu.solve(inside[:s, s:])
+    R = np.asarray(np.linalg.cholesky(inside).T)
+    log_det += 2.0 * float(np.log(np.diag(R)[:-1]).sum())
+    return log_det, float(R[-1, -1] ** 2)

@@ -46,6 +46,15 @@ class SplitColumns:
         """Return some rows (r,)."""
         return SplitColumns(self.narrow[rows], self.wide[rows])
 
+    def localize(self, rows: IntArray) -> tuple[IntArray, FloatArray]:
+        """Return the columns (c,) that some rows (r,) have, and their values (r, c)."""
+        part, s, used = self.narrow[rows], self.narrow.shape[1], np.zeros(0, dtype=np.int64)
+        if s:
+            used = find_distinct(part.indices).astype(np.int64)
+            part = part[:, used].toarray()
+        columns = np.concatenate([used, s + np.arange(self.wide.shape[1])])
+        return columns, np.concatenate([part, self.wide[rows]], axis=1)
+
     def append(self, columns: FloatArray) -> SplitColumns:
         """Return the matrix with further columns (R, c) at its end."""
         return replace(self, wide=np.concatenate([self.wide, columns], axis=1))
