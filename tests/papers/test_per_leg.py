@@ -77,7 +77,7 @@ def test_fixed_parameters_stay_and_the_others_are_identified():
     data = simulate(robot.with_values(values), poses, tracker(1e-12, 1e-12), 0, robot)
     estimate = identify_per_leg(robot, data, 4)
     found = estimate.robot.values
-    rows = {row["name"]: row for row in estimate.to_dict()["parameters"]}
+    rows = {row["name"]: row for row in estimate.list_parameters()}
     assert rows["leg4.length"]["estimate"] == rows["leg4.length"]["nominal"]
     np.testing.assert_array_equal(found[places], robot.values[places])
     np.testing.assert_allclose(found, values, rtol=0, atol=1e-9)  # [m], noise of 1e-12

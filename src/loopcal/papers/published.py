@@ -35,7 +35,7 @@ from functools import cache, cached_property
 from io import StringIO
 from itertools import groupby
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -44,6 +44,7 @@ from loopcal.io.core.outputs import FolderKind, write_result_folder
 from loopcal.io.core.text_file import to_json
 from loopcal.report.pictures import render_figure
 from loopcal.results import serialization
+from loopcal.results.description import Field, fields
 from loopcal.studies.study_result import Interval, compute_binomial_interval
 from loopcal.typing import BoolArray, FloatArray
 
@@ -71,6 +72,8 @@ class Table:
     note: str = ""
     shown: tuple[int, ...] | None = None
 
+    FIELDS: ClassVar[tuple[Field, ...]] = fields("name", "title", "note", "columns", "rows")
+
     @property
     def cut(self) -> str:
         """How many of its rows a page shows, as a sentence; empty where it shows all."""
@@ -90,10 +93,6 @@ class Table:
         assert all(len(row) == len(self.formats) for row in self.rows), self.name
         shown = self.rows if self.shown is None else [self.rows[i] for i in self.shown]
         return [tuple(map(show, row, self.formats)) for row in shown]
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return name, title, note, columns and all rows, for JSON."""
-        return {name: getattr(self, name) for name in ("name", "title", "note", "columns", "rows")}
 
 
 @dataclass(frozen=True)
@@ -433,6 +432,15 @@ class Reproduction:
     content: Content  # its results
     replaced: tuple[str, ...] = ()  # sizes of the study that another robot replaces, in sentences
 
+    FIELDS: ClassVar[tuple[Field, ...]] = fields(
+        *("paper", "title", "source", "about", "settings", "replaced"),
+        verdicts="content.verdicts",
+        figures="content.figures",
+        summary=lambda made: made.summary(),
+        comparisons=lambda made: [c.table() for c in made.content.comparisons],
+        tables="content.tables",
+    )
+
     @property
     def verdict_groups(self) -> dict[str, tuple[tuple[int, Verdict], ...]]:
         """Verdicts with their numbers on a page, by title: statements of the paper, own checks."""
@@ -453,17 +461,6 @@ class Reproduction:
         )
         return Table("summary", "Published and computed", columns, rows, ("", "d", "d", ".2g"))
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return all content by name, for JSON."""
-        return {
-            **{name: value for name, value in vars(self).items() if name != "content"},
-            "verdicts": self.content.verdicts,
-            "figures": self.content.figures,
-            "summary": self.summary().to_dict(),
-            "comparisons": [c.table().to_dict() for c in self.content.comparisons],
-            "tables": [table.to_dict() for table in self.content.tables],
-        }
-
 
 def write_page(reproduction: Reproduction, made_by: Mapping[str, Any]) -> str:
     """Return the page as Markdown; made_by : see `io.runs.run_folder.collect_provenance`."""
@@ -481,7 +478,7 @@ def write_page(reproduction: Reproduction, made_by: Mapping[str, Any]) -> str:
 
 def build_document(reproduction: Reproduction, made_by: Mapping[str, Any]) -> dict[str, Any]:
     """Return the content of result.json."""
-    return {"made_by": made_by, **reproduction.to_dict()}
+    return {"made_by": made_by, **serialization.json_fields(reproduction)}
 
 
 def write_folder(
@@ -499,7 +496,7 @@ def write_folder(
         stream = StringIO()
         csv.writer(stream, lineterminator="\n").writerows([table.columns, *rows])
         files[f"tables/{table.name}.csv"] = stream.getvalue().encode()
-        files[f"tables/{table.name}.json"] = to_json(table.to_dict()).encode()
+        files[f"tables/{table.name}.json"] = to_json(serialization.json_fields(table)).encode()
     styles = choose_styles(content.figures)
     for figure in content.figures:
         files[f"figures/{figure.name}.png"] = render_figure(draw(figure, styles), ".png")

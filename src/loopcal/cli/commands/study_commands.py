@@ -508,6 +508,7 @@ def per_leg(
       loopcal per-leg hexapod-42 measurements.csv --steps 2 -o per-leg.yaml
       loopcal per-leg hexapod-42 measurements.csv --steps 20 --epsilon 1e-3
     """
+    from loopcal.results.serialization import json_fields
     from loopcal.studies.simulation.published_steps import identify_per_leg
 
     machine = opt.open_robot(robot, (output,), data, force)
@@ -519,27 +520,30 @@ def per_leg(
     if not estimate.is_converged:
         reached, wanted = estimate.integrated_errors[-1], epsilon
         terminal.print_finding("fit.epsilon-not-met", steps=steps, reached=reached, wanted=wanted)
-    return Output(estimate.to_dict(), lambda: _view_legs(estimate, poses, output))
+    return Output(json_fields(estimate), lambda: _view_legs(estimate, poses, output))
 
 
 def _view_legs(estimate: PerLegEstimate, poses: int, output: Path | None) -> list[Block]:
     """Return the steps, the condition numbers of the legs and the parameters."""
     from loopcal.findings.wording import name_count
-    from loopcal.results.tables import Column, Table, word_column
+    from loopcal.results.description import Field
+    from loopcal.results.tables import Column, build_table
 
-    columns = (word_column("parameter"), *map(Column, ("unit", "nominal", "estimate", "change")))
-    parameters = estimate.to_dict()["parameters"]
+    parameters = estimate.list_parameters()
 
     def show(row: Mapping[str, Any], key: str) -> str:
         """Return six digits; 0 below a hundredth of the last digit of the largest in its unit."""
         size = max(abs(other[key]) for other in parameters if other["unit"] == row["unit"])
         return f"{row[key] if abs(row[key]) > 1e-8 * size else 0.0:.6g}"
 
-    rows = [
-        (row["name"], row["unit"], show(row, "nominal"), show(row, "estimate"),
-         f"{row['estimate'] - row['nominal']:+.3g}")
-        for row in parameters
-    ]  # fmt: skip
+    table = build_table(
+        "Parameters",
+        parameters,
+        Field("name", title="parameter"),
+        (Column("unit"), lambda row: row["unit"]),
+        *((Column(key), lambda row, key=key: show(row, key)) for key in ("nominal", "estimate")),
+        (Column("change"), lambda row: f"{row['estimate'] - row['nominal']:+.3g}"),
+    )
     conditions = ", ".join(f"{condition:.0f}" for condition in estimate.conditions)
     errors = ", ".join(f"{error:.2g}" for error in estimate.integrated_errors)
     name, count = estimate.robot.name, name_count(estimate.steps, "step")
@@ -548,7 +552,7 @@ def _view_legs(estimate: PerLegEstimate, poses: int, output: Path | None) -> lis
         f"{name} identified leg by leg from {poses} full poses: {count}",
         f"Largest error of a pose, max dQint, before and after each step: {errors} mm + rad",
         f"Condition numbers of the legs: {conditions}",
-        Table("Parameters", columns, tuple(rows)),
+        table,
         f"{note} For calibrations use loopcal calibrate.",
     ]
     return page if output is None else [*page, f"Written to {output}"]

@@ -36,7 +36,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, Literal, get_args
+from typing import Any, ClassVar, Literal, get_args
 
 import numpy as np
 
@@ -62,6 +62,7 @@ from loopcal.mechanism.sensitivity import differentiate_pose
 from loopcal.mechanism.solutions import Solution, forward, inverse
 from loopcal.mechanism.states import Status
 from loopcal.numerics.decomposition import Decomposition, are_nonzero, decompose, empty_factor
+from loopcal.results.description import Field, fields
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension
 
@@ -382,32 +383,25 @@ class PerLegEstimate:
     integrated_errors: FloatArray
     is_converged: bool = True
 
+    FIELDS: ClassVar[tuple[Field, ...]] = fields(
+        robot="robot.name",
+        parameters=lambda fit: fit.list_parameters(),
+        **{name: name for name in ("conditions", "steps", "integrated_errors", "is_converged")},
+    )
+
     @property
     def steps(self) -> int:
         """Number of steps."""
         return len(self.estimate_history) - 1
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the parameters in the units of the robot file, condition numbers, and steps."""
+    def list_parameters(self) -> list[dict[str, Any]]:
+        """Return name, unit, nominal value and estimate in the units of the robot file."""
         robot = self.robot
         shown = map(robot.list_shown, (robot.parameters.nominal, robot.values))
-        rows = [
-            {
-                "name": p.name,
-                "unit": robot.units[p.dimension],
-                "nominal": nominal,
-                "estimate": value,
-            }
-            for p, nominal, value in zip(robot.parameters.entries, *shown, strict=True)
+        return [
+            {"name": p.name, "unit": robot.units[p.dimension], "nominal": old, "estimate": new}
+            for p, old, new in zip(robot.parameters.entries, *shown, strict=True)
         ]
-        return {
-            "robot": self.robot.name,
-            "parameters": rows,
-            "conditions": self.conditions.tolist(),
-            "steps": self.steps,
-            "integrated_errors": self.integrated_errors.tolist(),
-            "is_converged": self.is_converged,
-        }
 
 
 def identify_per_leg(
