@@ -70,8 +70,6 @@ OPEN = 1e-6
 # are not linear.
 FAR = 0.1
 STEPS = 20  # of the iteration to the estimate
-# Share of the sum of squares by which a further step would lower it where the setup is not found.
-UNSETTLED = 0.01
 SETTLED = 1e-6  # squared length [standard deviations] of a step at which it ends
 # Difference of sums of squares up to which another row may be the wrong one, and the largest number
 # of such rows that is named.
@@ -202,11 +200,6 @@ class VisitFit:
     def is_located(self) -> bool:
         """Whether the rows determine the setup."""
         return not self.solution.open[np.isfinite(self.unit)].any()
-
-    @property
-    def is_settled(self) -> bool:
-        """Whether the iteration came to a minimum."""
-        return self.cost - self.solution.cost < UNSETTLED * (1.0 + self.solution.cost)
 
     @property
     def scale(self) -> tuple[float, float]:
@@ -384,16 +377,11 @@ def examine_row(before: Companion, measured: Measurements, pose: int) -> Verdict
     used = np.append(before.is_used, False)
     fitted = used & ~task.is_held_out[list(poses)]
     fit = linearize_visits(task, measured, fitted, None if before.fit is None else before.fit.x)
-    is_settled = True
     if not fit.is_located:  # the new row locates the setup, too
         joined = fit_visits(task, measured, fitted | is_new, before.fit)
         fit = linearize_visits(task, measured, fitted, joined.x)
-        is_settled = joined.is_settled
     expected = observe_visits(task, measured, fit.x + fit.solution.step).expected[-1]
     prediction, rows = predict_visit(measured, fit, n - 1), fit.rows
-    if not is_settled:  # the setup is somewhere else
-        unknown = np.full_like(prediction.sd, np.inf)
-        prediction = prediction._replace(sd=unknown, distance=0.0, degrees=0, p_value=1.0)
     data = {"pose": task.labels[pose], **_describe_worst(task.robot, measured, prediction)}
     same = [i for i in range(n - 1) if poses[i] == pose]
     doubted = [i for i in same if not used[i]]
@@ -416,7 +404,7 @@ def examine_row(before: Companion, measured: Measurements, pose: int) -> Verdict
             return conclude_drift(earlier[0])
         if prediction.degrees == 0:
             names = measured.nuisance_parameters.table.names
-            is_open = fit.solution.open[: len(names)].any(axis=1) | (not is_settled)
+            is_open = fit.solution.open[: len(names)].any(axis=1)
             return conclude("untestable", setup=tuple(names[i] for i in np.flatnonzero(is_open)))
         return conclude("fits", earlier=len(doubted))
     agreeing = [i for i in same if compare_visits(rows, i, n - 1, fit.scale) >= LEVEL]
