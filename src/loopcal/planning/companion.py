@@ -291,10 +291,10 @@ def _locate_setup(task: CompanionTask, measured: Measurements, x: FloatArray) ->
     """Return x (k,) with the setup that fits visits best at its machine."""
     free, z = task.problem.free, x[len(x) - len(task.problem.free) :]
     free = replace(free, robot=free.robot.with_values(free.values(z[None])[0]))
-    (observed,), nuisance = measured.observations, measured.nuisance_parameters
+    (observed,) = measured.observations
     distance = np.linalg.norm(np.nan_to_num(observed.measured - observed.measured[0]), axis=1)
     for chosen in (measured, measured.take(np.unique([0, distance.argmax()]))):
-        T = observe_poses(free, chosen.readings).T
+        T, nuisance = observe_poses(free, chosen.readings).T, chosen.nuisance_parameters
         values = [rows.measured[None] for rows in chosen.observations]
         with suppress(DataError):  # all points on one line, of which two are enough
             return np.append(guess_nuisance_values_batch(chosen, values, T, nuisance)[0], z)
