@@ -33,13 +33,13 @@ from loopcal.io.runs.result_files import format_comparison
 from loopcal.io.runs.run_folder import Run, build_document, refuse_changed_run
 from loopcal.mechanism.model import Mechanism
 from loopcal.plain_text import quote
-from loopcal.report.document.documents import (
+from loopcal.report.document.elements import CalibrationRecord, ControllerValues, render_html
+from loopcal.report.document.sections import (
     build_calibration_document,
     build_calibration_view,
     build_comparison_document,
     build_robot_view,
 )
-from loopcal.report.document.elements import CalibrationRecord, ControllerValues, render_html
 from loopcal.report.validation_view import tabulate_comparison
 from loopcal.results.serialization import json_fields, restore_numbers
 from loopcal.version import __version__

@@ -20,9 +20,9 @@ from loopcal.documents import load_record
 from loopcal.errors import DataError, FileError
 from loopcal.report.calibration_view import build_budget_table, build_share_table
 from loopcal.report.document import figures
-from loopcal.report.document.documents import build_calibration_document, build_sections
 from loopcal.report.document.elements import Document, Picture, render_html
 from loopcal.report.document.figures import thin_rows
+from loopcal.report.document.sections import build_calibration_document, build_sections
 from loopcal.report.scene.scene import load_script
 from loopcal.report.validation_view import view_errors
 from loopcal.report.words import say

@@ -12,8 +12,8 @@ import pytest
 import loopcal as lc
 from loopcal.documents import load_record
 from loopcal.io.runs.certificate import read_template
-from loopcal.report.document.documents import build_calibration_document, build_sections
 from loopcal.report.document.elements import Document, Form, Listing, Picture, Section, list_options
+from loopcal.report.document.sections import build_calibration_document, build_sections
 from loopcal.results.tables import Table
 from tests.io.test_instruments import FACTS, data, robot, with_instrument  # noqa: F401
 

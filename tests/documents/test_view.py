@@ -17,8 +17,8 @@ import loopcal as lc
 from loopcal.cli.entry_point import main
 from loopcal.documents import load_record, open_page
 from loopcal.errors import FileError
-from loopcal.report.document.documents import build_calibration_view
 from loopcal.report.document.elements import render_html
+from loopcal.report.document.sections import build_calibration_view
 
 
 def read_scene(page: Path) -> dict:
