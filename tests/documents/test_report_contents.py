@@ -14,6 +14,7 @@ from loopcal.documents import load_record
 from loopcal.io.runs.certificate import read_template
 from loopcal.report.document.elements import Document, Form, Listing, Picture, Section, list_options
 from loopcal.report.document.sections import build_calibration_document, build_sections
+from loopcal.report.words import say
 from loopcal.results.tables import Table
 from tests.io.test_instruments import FACTS, data, robot, with_instrument  # noqa: F401
 
@@ -125,7 +126,7 @@ def test_missed_limit_is_not_called_a_gate_that_is_met(report) -> None:
     record = load_record(report)
     missed = {**record.result, "verdict": "reservations", "passed": False}
     said = build_sections(replace(record, result=missed), ["verdict"])[0].elements[0]
-    assert "a stated limit is not kept" in str(said)
+    assert str(said) == say("verdict.limit-missed")
     kept = {**missed, "passed": True}
     said = build_sections(replace(record, result=kept), ["verdict"])[0].elements[0]
     assert str(said).startswith("All quality gates are met")

@@ -19,6 +19,7 @@ from loopcal.documents import load_record, open_page
 from loopcal.errors import FileError
 from loopcal.report.document.elements import render_html
 from loopcal.report.document.sections import build_calibration_view
+from loopcal.report.words import say
 
 
 def read_scene(page: Path) -> dict:
@@ -90,7 +91,7 @@ def test_view_of_a_fit_that_did_not_converge_shows_the_robot_before(run) -> None
     fit = {**record.result["fit"], "status": "out_of_iterations"}
     result = {**record.result, "verdict": "not_calibrated", "fit": fit, "headline": "Failed."}
     text = render_html(build_calibration_view(replace(record, result=result, posterior=None)))
-    assert "The fit did not converge" in text
+    assert say("scene-figure.not-converged") in text
     assert "The robot at home." in text
     assert '<header class="not_calibrated">' in text
 
