@@ -34,11 +34,6 @@ LIMIT = 5.0
 compares each row with all others grows sixteenfold.
 """
 
-SETUP_LIMIT = 4.5
-"""The same for setup parameters [processor time]. What decomposes those of all sessions or targets
-grows 64-fold.
-"""
-
 
 def _targets(robot: Mechanism, n: int) -> np.ndarray:
     """Random controlled coordinates in the workspace."""
@@ -73,13 +68,12 @@ def _growth(
     few: Callable[[], object],
     many: Callable[[], object],
     counts: tuple[int, int] = (FEW, MANY),
-    limit: float = LIMIT,
     clock: Callable[[], float] | None = None,
 ) -> Metric:
     """The ratio of the shorter of two times each."""
     less, more = (min(time_once(work, clock) for _ in range(2)) for work in (few, many))
     note = f"{less:.3g} s and {more:.3g} s for {counts[0]} and {counts[1]}"
-    return Metric(name, more / less, tolerance=None, limit=limit, note=note)
+    return Metric(name, more / less, tolerance=None, limit=LIMIT, note=note)
 
 
 def bench_reading() -> Metric:
@@ -131,7 +125,7 @@ def bench_sessions() -> Metric:
     data = [draw_sessions(robot, 4 * n, n, 3) for n in counts]
     few, many = (lambda d=d: calibrate(robot, d) for d in data)
     name = "growth.calibration_of_sessions"
-    return _growth(name, few, many, counts, SETUP_LIMIT, time.process_time)
+    return _growth(name, few, many, counts, time.process_time)
 
 
 def bench_targets() -> Metric:
@@ -140,4 +134,4 @@ def bench_targets() -> Metric:
     data = [draw_sessions(robot, 60, 1, n) for n in counts]
     few, many = (lambda d=d: calibrate(robot, d) for d in data)
     name = "growth.calibration_of_targets"
-    return _growth(name, few, many, counts, SETUP_LIMIT, time.process_time)
+    return _growth(name, few, many, counts, time.process_time)

@@ -343,7 +343,8 @@ def _refine_candidates(
         slopes = np.zeros((1, 1, 1, x.shape[1])) if by_nuisance is None else by_nuisance
         J = whiten_columns(white, np.broadcast_to(slopes, (c, r, m, x.shape[1])))
         e = whiten_columns(white, np.broadcast_to(evaluated.residual, (c, r, m))[..., None])
-        return e.reshape(c, -1), np.where(kept, 0.0, J).reshape(c, r * m, -1)
+        J = np.where(kept, 0.0, J) if kept.any() else J
+        return e.reshape(c, -1), J.reshape(c, r * m, -1)
 
     sets = np.repeat(np.arange(t * g), k)
     if most is not None and most < k:

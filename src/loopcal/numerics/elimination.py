@@ -548,11 +548,13 @@ def shorten_rows(rows: FloatArray, width: int) -> FloatArray:
     """
     a, M, w = rows.shape
     is_used = rows[..., :width].any(axis=0)
+    if not is_used.size:
+        return rows
     key = is_used @ np.random.default_rng(0).integers(1, 2**40, width)
     group = np.unique(key, return_inverse=True)[1]
-    g = int(group.max(initial=0)) + 1
-    used = np.zeros((g, width), dtype=bool)
-    np.logical_or.at(used, group, is_used)
+    order, g = np.argsort(group, kind="stable"), int(group.max()) + 1
+    starts = np.searchsorted(group[order], np.arange(g))
+    used = np.logical_or.reduceat(is_used[order], starts)
     narrow = int(used.sum(axis=1).max(initial=0)) + w - width
     if 2 * (M * narrow**2 + g * narrow * w**2) > M * w**2:
         return rows

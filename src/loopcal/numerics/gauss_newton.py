@@ -181,7 +181,9 @@ def _damp_step(
     scale = np.where(norm > 0.0, norm, 1.0)
     # one triangular factor, so that the decomposition does not grow with the rows
     columns = jacobian / scale[:, None, :]
-    stack = np.nan_to_num(np.concatenate([columns, residual[..., None]], axis=-1))
+    stack = np.concatenate([columns, residual[..., None]], axis=-1)
+    if not np.isfinite(stack.sum()):  # else no entry is infinite or NaN
+        stack = np.nan_to_num(stack)
     shorter = shorten_rows(stack, jacobian.shape[2])
     R = np.asarray(np.linalg.qr(shorter, mode="r"), dtype=float)
     U, s, V = np.linalg.svd(R[..., :-1], full_matrices=False)
