@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from loopcal.measure.camera_geometry import LENS, calibrate_camera
+from loopcal.measure.kinds.image import LENS, calibrate_camera
 
 FOLDER = Path("usr/share/doc/opencv-doc/examples/data")
 BOARD = np.array([[i % 9, i // 9, 0.0] for i in range(54)])

@@ -10,7 +10,7 @@ import pytest
 from loopcal import geometry, load_robot
 from loopcal.errors import DataError, LoopcalError
 from loopcal.io.data.measurement_file import load_measurements, save_measurements
-from loopcal.measure.camera_geometry import (
+from loopcal.measure.kinds.image import (
     calibrate_camera,
     find_rays,
     locate_boards,
