@@ -31,6 +31,8 @@ from loopcal.measure.instrument import Gaussian, Instrument, Sensor
 from loopcal.measure.kinds.poses import Pose
 from loopcal.measure.kinds.position import Position
 from loopcal.measure.simulation import sample_truth, simulate
+from loopcal.report.calibration_view import view_calibration
+from loopcal.results.tables import render_text
 from tests.estimate.problems import hexapod, hexapod_data
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "hexapod-42" / "measurements.csv"
@@ -91,9 +93,10 @@ def test_good_calibration_reaches_the_noise_floor_and_has_a_next_step(report):
     assert report.fitted_errors is None
 
 
-def test_text_and_repr_have_fewer_than_20_lines(report):
+def test_text_and_repr_are_the_summary_of_the_command_on_one_screen(report):
     for text in (str(report), repr(report)):
-        assert len(text.splitlines()) < 20
+        assert text == render_text(view_calibration(report), 1000)
+        assert len(text.splitlines()) < 40  # of 42 parameters only those that moved most
         assert text.startswith("Calibrated: hexapod-42, 42 parameters from 30 poses.")
 
 
@@ -153,7 +156,7 @@ def test_without_held_out_poses_the_verdict_is_undecided(robot, data, unvalidate
     assert report.validation is None
     assert report.fitted_errors is not None
     text = str(report)
-    assert "Errors at the fitted poses, which are optimistic:\n  position (rms): " in text
+    assert "Errors at 40 fitted (optimistic) poses, in the stated frame\n" in text
     assert "Validation" not in text
 
 

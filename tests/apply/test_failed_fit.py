@@ -143,8 +143,8 @@ def test_fit_that_leads_away_from_a_geometry_without_poses_is_not_called_a_failu
     assert "fit.poses-open-at-start" in [f.code for f in first.findings]
     assert first.fitted_errors is not None
     assert len(first.fitted_errors.poses) == 12
-    (all_kinds,) = re.findall(r"(\S+) sigma before, (\S+) sigma after", str(first.fitted_errors))
-    assert float(all_kinds[0]) > 1e4 > 1e3 * float(all_kinds[1])
+    (all_kinds,) = first.fitted_errors.changes().values()
+    assert all_kinds.before > 1e4 > 1e3 * all_kinds.after  # [sigma]
     lc.save_robot(first.identification.robot, tmp_path / "corrected.yaml")
     second = calibrate(lc.load_robot(tmp_path / "corrected.yaml"), data, options)
     assert second.fitted_errors is not None

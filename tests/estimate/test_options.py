@@ -70,8 +70,8 @@ def test_directions_determined_by_tolerances_alone_are_counted() -> None:
 @pytest.mark.parametrize(
     ("given", "words"),
     [
-        ({"noise": "guessed"}, "'given' or 'estimated'"),
-        ({"begin": "anywhere"}, "'kinematics' or 'closure'"),
+        ({"noise": "guessed"}, "'given', 'estimated'"),
+        ({"begin": "anywhere"}, "'kinematics', 'closure'"),
         ({"loss": Huber}, r"Huber\(\) or Tukey\(\)"),
         ({"rank_tolerance": 2.0}, "above 0 and below 1"),
     ],

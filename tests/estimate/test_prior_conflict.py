@@ -230,7 +230,7 @@ def test_a_single_wrong_nominal_value_is_named(size):
     assert conflict.conflict
     assert conflict.parameter.names == ("leg3.length",)
     assert conflict.parameter.p_value < conflict.p_value
-    assert "leg3.length is " in conflict.sentence
+    assert "leg3.length is " in str(conflict.finding)
 
 
 def move_parameter(name: str, size: float):

@@ -83,8 +83,8 @@ def test_setup_parameters_are_listed_with_their_uncertainty(linear_delta) -> Non
     assert set(table.unit) == {"deg", "mm"}
     assert_allclose(table.sd[3:], 1e3 * nuisance.sd[3:])
     lines = str(nuisance).splitlines()
-    assert len(lines) == 7
-    assert {len(line.split()) for line in lines[1:]} == {4}
+    assert len(lines) == 8
+    assert {len(line.split()) for line in lines[2:]} == {4}
     assert len(repr(nuisance)) < 100
     assert nuisance._repr_html_()
 
@@ -129,7 +129,7 @@ def test_validation_by_readings_alone_has_narrow_bars_with_their_numbers() -> No
     readings = lc.Measurements(robot.name, data.readings, (), reading_sigma=data.reading_sigma)
     fitted, held_out = readings.split(hold_out=0.25, seed=1)
     validation = lc.validate(lc.identify(robot, fitted), held_out)
-    assert str(validation).startswith("Validation on the actuator readings of 6 poses:")
+    assert str(validation).startswith("Errors at 6 measured poses, divided by sigma\nkind ")
     figure = validation.plot()
     check(figure)
     (axes,) = figure.axes

@@ -146,7 +146,8 @@ def calibrate(
         filled = exclude_poses(fill_in_reading_sigma(robot, data), options.fit.excluded_poses)
         refuse_reused_rows(options.prior, filled)
     split = split_data(kept, options.hold_out, options.seed, options.held_out)
-    if options.has_limit and split.held_out is None:
+    is_limited = (options.limit_position, options.limit_angle) != (None, None)
+    if is_limited and split.held_out is None:
         raise DataError(report_finding("workflow.limit-needs-held-out-poses"))
     if options.check_conventions:
         # no pose can be reached from a frame that does not fit, and a fit would blame the robot
@@ -266,23 +267,19 @@ def _fit(
             raise DataError(report_finding("workflow.no-parameter-chosen", not_compared=left_out))
     chosen = robot if choice is None else choice.robot
     free, available = int(chosen.parameters.free.sum()), count_equations(chosen, data)
-    if fit_options.method is None and available < free and not _can_spare(chosen, data):
-        from loopcal.diagnose.identifiable_parameters import describe_missing_equations
+    if fit_options.method is None and available < free:
+        problem = problem_of(select_free_parameters(chosen), data)
+        z = problem.free.deviation(chosen.values[None])
+        if not has_equations_to_spare(problem, z, LeastSquares()):
+            from loopcal.diagnose.identifiable_parameters import describe_missing_equations
 
-        missing = describe_missing_equations(chosen, data) or ""
-        counts: dict[str, Any] = {"equations": available, "parameters": free}
-        counts |= {"held_out": held_out, "suggestions": missing}
-        raise DataError(report_finding("workflow.too-few-equations", **counts))
+            missing = describe_missing_equations(chosen, data) or ""
+            counts: dict[str, Any] = {"equations": available, "parameters": free}
+            counts |= {"held_out": held_out, "suggestions": missing}
+            raise DataError(report_finding("workflow.too-few-equations", **counts))
     count.begin(f"fitting {free} parameters")
     fit = identify(chosen, data, options=fit_options, progress=count.progress)
     return fit, choice, None
-
-
-def _can_spare(robot: Mechanism, data: Measurements) -> bool:
-    """Return whether data determine with fewer equations what they can determine at all."""
-    problem = problem_of(select_free_parameters(robot), data)
-    z = problem.free.deviation(robot.values[None])
-    return has_equations_to_spare(problem, z, LeastSquares())
 
 
 def _report(

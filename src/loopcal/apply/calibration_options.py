@@ -116,11 +116,6 @@ class CalibrationOptions:
         if self.prior is not None and excluded:
             raise DataError(report_finding("workflow.option-excludes-prior", option=excluded[0]))
 
-    @property
-    def has_limit(self) -> bool:
-        """Whether an error on held-out poses is limited."""
-        return self.limit_position is not None or self.limit_angle is not None
-
     def to_dict(self) -> dict[str, Any]:
         """Return the options as plain data; an object is `{object: text}`, see `FitOptions`."""
         plain = {

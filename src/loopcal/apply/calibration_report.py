@@ -56,8 +56,6 @@ if TYPE_CHECKING:
     from loopcal.estimate.recalibration import Change
 
 TOP = 3  # findings that a summary shows
-# Heading of the errors where no pose was held out.
-FITTED_ERRORS = "Errors at the fitted poses, which are optimistic:"
 
 
 @dataclass(frozen=True)
@@ -271,21 +269,7 @@ class CalibrationReport(DeferredFields, TableResult):
             + (f" The limit of {' and '.join(missed)} fails." if missed else "")
         )
 
-    def __str__(self) -> str:
-        """Return verdict, expected and validated errors, findings, recommendation and next step."""
-        errors = self.validation or self.fitted_errors
-        lines = [self.headline]
-        if self.budget is not None and self.states_expected_error:
-            lines.append(str(self.budget.summary))
-        lines += [] if self.volume is None else map(str, self.volume.findings)
-        if errors is not None:
-            lines += str(errors).splitlines()[:1] if self.validation else [FITTED_ERRORS]
-            lines += errors.describe_rms()
-        lines += [f"{finding.severity.value}: {finding}" for finding in self.top_findings]
-        lines.append(f"Recommendation: {self.recommendation}")
-        return "\n".join([*lines, f"Next: {self.next_step}"])
-
-    __repr__ = __str__
+    __repr__ = TableResult.__str__
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Return arrays to store [SI]: those of the fit, the `initial` values of all parameters,

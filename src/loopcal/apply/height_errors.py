@@ -30,7 +30,6 @@ from loopcal.errors import DataError
 from loopcal.estimate.residual_test import DOUBT
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, Quantity, report_finding
-from loopcal.findings.wording import round_to_digits
 from loopcal.measure.kinds.poses import Component
 from loopcal.measure.kinds.surfaces import Plane
 from loopcal.measure.measurements import Measurements
@@ -139,17 +138,7 @@ class HeightErrors(DrawnResult):
             if (self.is_held_out == is_held_out).any():
                 yield name, is_held_out
 
-    def __str__(self) -> str:
-        """Return one line for the fitted and one for the held-out heights."""
-        factor, symbol = self.unit.factor_to_si, self.unit.symbol
-        lines = [f"Height errors at {len(self.poses)} points:"]
-        for name, is_held_out in self.list_sets():
-            before, after = (self.statistics(e, is_held_out) for e in ("before", "after"))
-            rms = [f"{round_to_digits(s.rms / factor)} {symbol}" for s in (before, after)]
-            lines.append(f"  {name} ({after.count}): rms {rms[0]} before, {rms[1]} after")
-        return "\n".join(lines)
-
-    __repr__ = __str__
+    __repr__ = DrawnResult.__str__
 
 
 def map_height_errors(

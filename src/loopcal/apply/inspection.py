@@ -50,38 +50,26 @@ class IdentifiabilityReport:
     @cached_property
     def summary(self) -> tuple[Finding, ...]:
         """Rank, what is undetermined in words, what is known poorly, and what to measure."""
-        by_code = {finding.code: finding for finding in self.analysis.findings}
-        return (
-            by_code["identifiability.rank"],
-            *(f for code, f in by_code.items() if code == "identifiability.arbitrary-cut"),
-            *(() if self.useful is None else self.useful.findings),
-            *self._report_undetermined(),
-            by_code["identifiability.improved"],
-            *self._report_measurement(),
-        )
-
-    def _report_undetermined(self) -> list[Finding]:
-        """Return how many undetermined combinations are harmless, and how many change poses."""
-        analysis, alone = self.analysis, self.is_readings_alone
-        if not analysis.unidentifiable:
-            return []
-        findings, changing = report_undetermined(
-            analysis.free_parameters, analysis.unidentifiable, is_readings_alone=alone
-        )
-        return [*findings, *(c.finding for c in changing if len(changing) <= FEW)]
-
-    def _report_measurement(self) -> list[Finding]:
-        """Return the further measurement that determines most combinations that move the platform
-        or a frame, the simplest of them; or that none does.
-        """
+        analysis = self.analysis
+        by_code = {finding.code: finding for finding in analysis.findings}
+        cut = by_code.get("identifiability.arbitrary-cut")
+        findings = [by_code["identifiability.rank"], *([] if cut is None else [cut])]
+        findings += () if self.useful is None else self.useful.findings
+        if open_ones := analysis.unidentifiable:  # how many are harmless, and how many change poses
+            given = (analysis.free_parameters, open_ones)
+            counts, changing = report_undetermined(*given, is_readings_alone=self.is_readings_alone)
+            findings += [*counts, *(c.finding for c in changing if len(changing) <= FEW)]
+        findings.append(by_code["identifiability.improved"])
+        # the measurement that determines most combinations that move the platform or a frame, the
+        # simplest of them; or that none does
         suggestions = [s for s in self.suggestions if not s.combination.is_harmless]
         solved = Counter(m.words for s in suggestions for m in s.measurements)
         if not solved:
-            return [s.finding for s in suggestions]
+            return (*findings, *(s.finding for s in suggestions))
         (words, count), total = solved.most_common(1)[0], len(suggestions)
         stated: dict[str, Any] = {"words": words, "count": count}
         stated |= {"total": total, "left": total - count}
-        return [report_finding("identifiability.measure-for-all", **stated)]
+        return (*findings, report_finding("identifiability.measure-for-all", **stated))
 
     FIELDS: ClassVar[tuple[Field, ...]] = (
         *within("analysis", [field for field in Identifiability.FIELDS if field.name != "scaling"]),

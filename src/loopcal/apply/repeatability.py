@@ -30,7 +30,6 @@ from loopcal.diagnose.row_errors import compare_predictions, compute_noise_floor
 from loopcal.errors import DataError
 from loopcal.estimate.residual_test import coverage_factor
 from loopcal.findings import Finding, report_finding
-from loopcal.findings.wording import round_to_digits
 from loopcal.measure.data_checks import check_actuators
 from loopcal.measure.kinds.kind import ErrorGroup
 from loopcal.measure.measurements import Measurements
@@ -41,7 +40,7 @@ from loopcal.numerics.statistics import compute_chi_square_quantile
 from loopcal.results.description import Field, fields
 from loopcal.results.result import DrawnResult
 from loopcal.typing import FloatArray
-from loopcal.units import DISPLAY_UNITS, SI_SYMBOLS, Dimension
+from loopcal.units import SI_SYMBOLS, Dimension
 
 POSITION, ORIENTATION = "position", "orientation"
 DIMENSIONS = {POSITION: Dimension.LENGTH, ORIENTATION: Dimension.ANGLE}
@@ -166,19 +165,6 @@ class Repeatability(DrawnResult):
     def __repr__(self) -> str:
         counts = (f"{name} of {len(poses)} visited poses" for name, poses in self.poses.items())
         return f"<Repeatability: {', '.join(counts)}>"
-
-    def __str__(self) -> str:
-        """Return the largest values of each quantity, and the findings."""
-        lines = []
-        for name, poses in self.poses.items():
-            unit, words = DISPLAY_UNITS[DIMENSIONS[name]], []
-            accuracies = [abs(e.value) for pose in poses for e in pose.list_accuracies()]
-            repeatabilities = [e.value for pose in poses for e in pose.list_repeatabilities()]
-            for symbol, values in (("AP", accuracies), ("RP", repeatabilities)):
-                size = round_to_digits(max(values) / unit.factor_to_si)
-                words.append(f"{symbol} {size} {unit.symbol}")
-            lines.append(f"{name}, largest of {len(poses)}: {', '.join(words)}")
-        return "\n".join([*lines, *(f"{f.severity.value}: {f}" for f in self.findings)])
 
 
 def assess_repeatability(

@@ -171,13 +171,7 @@ class RunComparison(DrawnResult):
         answers = [pair.moved for pair in self.pairs if pair.moved is not None]
         return any(answers) if answers else None
 
-    def __str__(self) -> str:
-        """Return the findings, one on each line."""
-        names = ", ".join(run.name for run in self.runs)
-        lines = [f"{f.severity.value}: {f}" for f in self.findings]
-        return "\n".join([f"Comparison of {names}:", *lines])
-
-    __repr__ = __str__
+    __repr__ = DrawnResult.__str__
 
 
 def compare_runs(runs: Sequence[Run], data: Measurements | None = None) -> RunComparison:

@@ -46,7 +46,7 @@ from loopcal.estimate.posterior import ModelDiscrepancy
 from loopcal.estimate.residual_test import SIGMA_AS_STATED, NoiseKnowledge
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, Quantity, Severity, report_finding
-from loopcal.findings.wording import list_names, name_count, round_to_digits
+from loopcal.findings.wording import list_names
 from loopcal.measure.data_checks import check_actuators, check_types
 from loopcal.measure.fitted_rows import FittedRows
 from loopcal.measure.kinds.kind import SCALES
@@ -56,7 +56,6 @@ from loopcal.numerics.statistics import compute_f_quantile, find_distinct
 from loopcal.results.description import Field, fields
 from loopcal.results.result import DrawnResult
 from loopcal.results.storage import restore
-from loopcal.results.tables import choose_unit
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import SI_SYMBOLS, Unit
 
@@ -278,30 +277,7 @@ class Validation(DrawnResult):
             )
         ]
 
-    def __str__(self) -> str:
-        """Return one line for each quantity, and the findings."""
-        words = f"{name_count(len(self.poses), 'row')}, {self.frame}"
-        if not self.poses:
-            words = f"the actuator readings of {name_count(self.judged, 'pose')}"
-        lines = [f"Validation on {words}:", *self.describe_rms()]
-        return "\n".join([*lines, *(f"{f.severity.value}: {f}" for f in self.findings)])
-
-    def describe_rms(self) -> list[str]:
-        """Return one line for each quantity: its rms before and after, and the noise floor."""
-        lines = []
-        for quantity, change in self.changes().items():
-            values = (change.before, change.after, change.noise_floor)
-            name, factor, symbol = "all kinds", 1.0, "sigma"
-            if (unit := self.units.get(quantity)) is not None:
-                unit = choose_unit(unit, values[1:])  # errors before may be far larger
-                name, factor, symbol = quantity, unit.factor_to_si, unit.symbol
-            before, after, floor = (f"{round_to_digits(v / factor)} {symbol}" for v in values)
-            lines.append(
-                f"  {name} (rms): {before} before, {after} after calibration (noise floor {floor})"
-            )
-        return lines
-
-    __repr__ = __str__
+    __repr__ = DrawnResult.__str__
 
     @property
     def checked(self) -> Validation:
@@ -395,8 +371,12 @@ def validate(
     limits = {"position": limit_position, "orientation": limit_angle}
     slow = None if uncertainty is None else uncertainty.posterior.discrepancy
     result = _summarize(robot, compared, limits, noise, slow)
-    blunders = _find_blunders(robot, compared, uncertainty)
-    rest = None
+    # compared poses that do not fit the calibrated robot; without its uncertainty the noise and
+    # the other poses decide
+    usable, after = compared.data.take(compared.usable), compared.after
+    values = dict(zip(after.setup.table.names, after.values[0].tolist(), strict=True))
+    check = check_held_out_rows(robot, usable, values, after.kept, uncertainty)
+    blunders, rest = () if check is None else name_blunders(check, usable), None
     if blunders:
         named = {label for blunder in blunders for label in blunder.poses}
         wrong = np.array([label in named for label in data.labels])
@@ -417,7 +397,11 @@ def validate(
             *report_base_targets(data),
             *_report_moved_setup(robot, compared, kept),
             *_report_left_out(data, compared),
-            *_report_few_rows(result.after),
+            *(
+                report_finding("validation.few-rows", quantity=quantity, count=count)
+                for quantity, errors in result.after.quantities.items()
+                if 0 < (count := len(find_distinct(errors.rows))) < FEW_ROWS
+            ),
             *_report_setup(compared.before, compared.after),
         ),
         blunders=blunders,
@@ -468,9 +452,6 @@ def _summarize(
 def find_error_units(robot: Mechanism, errors: PoseErrors) -> dict[str, Unit]:
     """Return the unit of each quantity of errors, that in which a robot shows its dimension."""
     return {name: robot.get_unit(e.dimension) for name, e in errors.quantities.items()}
-
-
-# Limits.
 
 
 # Setup parameters: frames, targets, surfaces and offsets.
@@ -549,16 +530,6 @@ def _report_moved_setup(
 # Poses and quantities of which little or nothing is compared.
 
 
-def _report_few_rows(after: PoseErrors) -> list[Finding]:
-    """Report quantities that too few rows measure."""
-    counts = {name: len(find_distinct(errors.rows)) for name, errors in after.quantities.items()}
-    return [
-        report_finding("validation.few-rows", quantity=quantity, count=count)
-        for quantity, count in counts.items()
-        if 0 < count < FEW_ROWS
-    ]
-
-
 def _report_left_out(data: Measurements, compared: PredictionComparison) -> list[Finding]:
     """Report poses with rows that no statistic contains, and poses that were estimated."""
     has_rows = np.zeros(data.n_poses, dtype=bool)
@@ -622,18 +593,6 @@ def _report_unpredicted(
 
 
 # Held-out poses that neither the calibration nor the others explain.
-
-
-def _find_blunders(
-    robot: Mechanism, compared: PredictionComparison, uncertainty: FitUncertainty | None
-) -> tuple[Blunder, ...]:
-    """Return the compared poses that do not fit the calibrated robot; without its `uncertainty`
-    the noise and the other poses decide.
-    """
-    data, after = compared.data.take(compared.usable), compared.after
-    values = dict(zip(after.setup.table.names, after.values[0].tolist(), strict=True))
-    check = check_held_out_rows(robot, data, values, after.kept, uncertainty)
-    return () if check is None else name_blunders(check, data)
 
 
 def _report_blunders(

@@ -325,7 +325,10 @@ def recommend_values(
             return report_finding("values.keep-undecided")
         if start.verdict is StartVerdict.WITHIN_ERRORS:  # only other regions could show a gain
             return report_finding("values.keep-within-noise")
-        return report_finding(_judge_fitted(residual_test, findings))
+        if residual_test.is_doubtful:
+            return report_finding("values.keep-doubtful-residuals")
+        is_gain = all(finding.code != NO_GAIN for finding in findings)
+        return report_finding("values.apply-fitted" if is_gain else "values.keep-no-gain")
     known = (0.0, 0.0) if is_open else (checked.noise.scale, checked.noise.degrees)
     every = checked.kinds[-1]
     probability = every.compute_better_probability(*known, checked.values_left)
@@ -337,12 +340,3 @@ def recommend_values(
     stated: dict[str, Any] = {"probability": probability, "needed": LEVEL}
     stated["is_slow"] = every.slow > 0.0
     return report_finding(f"values.{code}", poses=checked.judged, **stated)
-
-
-def _judge_fitted(test: ResidualTest, findings: Iterable[Finding]) -> str:
-    """Return the code of the recommendation by fitted poses alone, whose gain is beyond noise."""
-    if test.is_doubtful:
-        return "values.keep-doubtful-residuals"
-    if any(finding.code == NO_GAIN for finding in findings):
-        return "values.keep-no-gain"
-    return "values.apply-fitted"

@@ -365,26 +365,6 @@ def share_factor(
     return SharedFactor(solution, start, np.array(r), by_residuals, inverse[:, len(A) :] @ fixed)
 
 
-def take_chords(
-    problem: Problem, shared: SharedFactor, deviation: FloatArray
-) -> tuple[FloatArray, FloatArray, Start]:
-    """Return where one chord leads from deviations (t, p), which are equal in all trials; by how
-    much it changes the whitened residuals, to first order, infinite in trials that begin where they
-    were; and the start for the linearization there.
-    """
-    t = len(deviation)
-    kinds = problem.residuals(deviation, shared.solution)
-    residual = np.concatenate([kind.whitened.reshape(t, -1) for kind in kinds], axis=1)
-    # one product for each trial: a product of all of them would round by their number
-    step = np.matmul(shared.by_residuals, residual[:, :, None])
-    step = -(step + np.matmul(shared.by_deviation, deviation[:, :, None]))[:, :, 0]
-    length = np.linalg.norm(np.matmul(shared.triangle, step[:, :, None])[:, :, 0], axis=1)
-    good = np.isfinite(length)
-    moved = np.where(good[:, None], deviation + step, deviation)
-    start = shared.start.take(np.zeros(t, dtype=np.int64))
-    return moved, np.where(good, length, np.inf), start
-
-
 def identify_trials(
     robot: Mechanism,
     trials: Trials,
@@ -469,7 +449,12 @@ def _fit_parts(
     start = None if problem.nuisance is None else problem.start(z)
 
     def fit(part: IntArray) -> tuple[FloatArray, IntArray, IntArray, FloatArray, LinearModel]:
-        own, begin = _cut_problem(problem, part), None if start is None else start.take(part)
+        begin = None if start is None else start.take(part)
+        own, of_parts = problem.take(part), np.arange(len(part))
+        if problem.folds_plain_rows:  # measured columns are prepared once for all steps of a fit
+            numbers, data = problem.trials[part], problem.data
+            cut = problem.with_rows(r.cut_trials(numbers) for r in problem.rows)
+            own = replace(cut, trials=of_parts, data=lambda i: data(int(numbers[i])))
         if shared is None:
             first = fit_rows(own, z[part], begin, options)
         else:
@@ -489,19 +474,29 @@ def _fit_parts(
 def _descend_from_chords(
     problem: Problem, z: FloatArray, options: FitOptions, shared: SharedFactor
 ) -> Descent:
-    """Return the descents that begin with chords; without them in trials that do not converge."""
-    begin, length, start = take_chords(problem, shared, z)
+    """Return the descents that begin with chords from deviations z (t, p), which are equal in all
+    trials; without them in trials that do not converge.
+    """
+    t = len(z)
+    kinds = problem.residuals(z, shared.solution)
+    residual = np.concatenate([kind.whitened.reshape(t, -1) for kind in kinds], axis=1)
+    # one product for each trial: a product of all of them would round by their number
+    step = np.matmul(shared.by_residuals, residual[:, :, None])
+    step = -(step + np.matmul(shared.by_deviation, z[:, :, None]))[:, :, 0]
+    # by how much a chord changes the whitened residuals, to first order
+    length = np.linalg.norm(np.matmul(shared.triangle, step[:, :, None])[:, :, 0], axis=1)
+    good = np.isfinite(length)
     fit = descend(
         problem,
-        begin,
+        np.where(good[:, None], z + step, z),
         get_method(options),
         options.control,
         options.rank_tolerance,
-        start,
-        arrival=length,
+        shared.start.take(np.zeros(t, dtype=np.int64)),
+        arrival=np.where(good, length, np.inf),
         sufficient=ACCEPTED_STEP,
     )
-    fit = replace(fit, iterations=fit.iterations + np.isfinite(length))
+    fit = replace(fit, iterations=fit.iterations + good)
     again = np.flatnonzero(fit.status != DescentStatus.CONVERGED)
     if not again.size:
         return fit
@@ -518,19 +513,6 @@ def divide_trials(problem: Problem, threads: int) -> list[IntArray]:
     if 2 * count > 3 * least:  # a part takes milliseconds of Python, which runs in one thread
         count = least
     return np.array_split(np.arange(len(problem)), count)
-
-
-def _cut_problem(problem: Problem, trials: IntArray) -> Problem:
-    """Return the problem of some trials, where rows are plain with arrays of their own.
-
-    The measured columns are then prepared once for all steps of a fit.
-    """
-    if not problem.folds_plain_rows:
-        return problem.take(trials)
-    numbers, data, own = problem.trials[trials], problem.data, np.arange(len(trials))
-    rows = (r.cut_trials(numbers) for r in problem.rows)
-    cut = problem.with_rows(rows)
-    return replace(cut, trials=own, data=lambda i: data(int(numbers[i])))
 
 
 def compute_trial_posterior(fits: IdentifiedTrials, trials: Trials, trial: int) -> Posterior:

@@ -12,10 +12,11 @@ import dataclasses
 import inspect
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
-from typing import Any, Literal, get_args
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
+from loopcal.checks import Limit, Limited
 from loopcal.errors import DataError, EstimationError, suggest_names
 from loopcal.estimate.descent import StepControl
 from loopcal.estimate.losses import LOSSES, Loss
@@ -39,8 +40,17 @@ METHOD_PARTS = ("required_equations", "unpenalized", "root", "penalty")
 """Attributes that make an object a method, see `loopcal.estimate.penalties.Method`."""
 
 
+def _instances(attributes: Sequence[str], examples: str) -> Limit:
+    """Return the limit of objects that are no class and have these attributes."""
+    return Limit(
+        lambda x: not isinstance(x, type) and all(hasattr(x, name) for name in attributes),
+        f"an instance such as {examples}",
+        repr,
+    )
+
+
 @dataclass(frozen=True, eq=False)
-class FitOptions:
+class FitOptions(Limited):
     """Options of a fit. Every field has a default; `FitOptions()` is what `identify` uses.
 
     Parameters
@@ -88,33 +98,24 @@ class FitOptions:
     excluded_poses: Sequence[str] = ()
     nuisance: NuisanceParameters | None = None
 
+    ERROR = EstimationError
+    LIMITS: ClassVar[Mapping[str, Limit]] = {
+        "sigma_uncertainty": Limit(
+            lambda value: 0.0 <= value <= 1.0, "from 0 (the given sigmas are exact) to 1"
+        ),
+        "method": _instances(METHOD_PARTS, "MAP(), LeastSquares(), Ridge(1.0) or TruncatedSVD(10)"),
+        "loss": _instances(("weight",), "Huber() or Tukey()"),
+        "rank_tolerance": Limit(lambda value: 0.0 < value < 1.0, "above 0 and below 1"),
+    }
+
     def __post_init__(self) -> None:
-        _check_choice("noise", self.noise, get_args(Noise))
-        _check_choice("begin", self.begin, get_args(Begin))
-        if not 0.0 <= self.sigma_uncertainty <= 1.0:
-            raise EstimationError(
-                f"sigma_uncertainty is {self.sigma_uncertainty}, but must be from 0 (the "
-                f"given sigmas are exact) to 1"
-            )
-        if self.method is not None and not _is_instance_with(self.method, METHOD_PARTS):
-            raise EstimationError(
-                f"method is {self.method!r}, but must be an instance such as MAP(), "
-                "LeastSquares(), Ridge(1.0) or TruncatedSVD(10)"
-            )
-        if self.loss is not None and not _is_instance_with(self.loss, ("weight",)):
-            raise EstimationError(
-                f"loss is {self.loss!r}, but must be an instance such as Huber() or Tukey()"
-            )
+        super().__post_init__()
         if self.prior is not None:
             check_type(self.prior, Prior, "prior", "as from prior_from(fit.posterior)")
         check_type(self.control, StepControl, "control", "such as StepControl(iterations=100)")
         if self.nuisance is not None:
             wanted = "such as measurements.nuisance_parameters"
             check_type(self.nuisance, NuisanceParameters, "nuisance", wanted)
-        if not 0.0 < self.rank_tolerance < 1.0:
-            raise EstimationError(
-                f"rank_tolerance is {self.rank_tolerance}, but must be above 0 and below 1"
-            )
         object.__setattr__(
             self, "excluded_poses", check_labels("excluded_poses", self.excluded_poses)
         )
@@ -296,18 +297,6 @@ def check_labels(option: str, labels: Sequence[str]) -> tuple[str, ...]:
     for label in given:
         check_type(label, str, option, f"the label of a pose, such as '{label}'")
     return given
-
-
-def _check_choice(name: str, value: str, allowed: tuple[str, ...]) -> None:
-    """Refuse a word that is not allowed."""
-    if value not in allowed:
-        words = " or ".join(repr(word) for word in allowed)
-        raise EstimationError(f"{name} is {value!r}, but must be {words}")
-
-
-def _is_instance_with(value: object, attributes: Sequence[str]) -> bool:
-    """Return whether a value is no class and has these attributes."""
-    return not isinstance(value, type) and all(hasattr(value, name) for name in attributes)
 
 
 def _is_default(value: Any, entry: dataclasses.Field[Any]) -> bool:

@@ -540,16 +540,11 @@ class PriorConflict:
     components: tuple[ToleranceComponent, ...]
     component_rows: tuple[dict[str, object], ...]
 
-    FIELDS: ClassVar[tuple[Field, ...]] = fields(
-        *("statistic", "degrees", "p_value"),
-        worst_direction="direction",
-        worst_parameter="parameter",
-        joint_p_value="joint_p_value",
-        inflation="inflation",
-        components="component_rows",
-        conflict="conflict",
-        farthest="farthest",
-        sentence="sentence",
+    FIELDS: ClassVar[tuple[Field, ...]] = (
+        *fields("statistic", "degrees", "p_value", worst_direction="direction"),
+        *fields(worst_parameter="parameter", joint_p_value="", inflation=""),
+        *fields(components="component_rows", conflict="", farthest=""),
+        *fields(sentence=lambda conflict: str(conflict.finding)),
     )
 
     @property
@@ -562,7 +557,10 @@ class PriorConflict:
         """Whether the tolerances agree with the data, and what the method did."""
         if self.degrees < 0.5:
             return report_finding("prior.untested")
-        inflated, worst = self.inflation > 1.0 or bool(self.components), self._worst
+        inflated = self.inflation > 1.0 or bool(self.components)
+        # of a parameter or direction, where it is more significant than the test of all
+        worst = min(self.parameter, self.direction, key=lambda test: test.p_value)
+        is_worst = worst.p_value < self.p_value
         if not self.conflict and self.components:
             return report_finding(
                 "prior.components-inflated", parts=self.component_rows, factor=self.inflation
@@ -574,8 +572,8 @@ class PriorConflict:
             ratio=float(np.sqrt(self.statistic / self.degrees)),
             names=tuple(name for name, _ in self.farthest),
             deviations=tuple(deviation for _, deviation in self.farthest),
-            worst=() if worst is None else worst.names,
-            worst_statistic=0.0 if worst is None else worst.statistic,
+            worst=worst.names if is_worst else (),
+            worst_statistic=worst.statistic if is_worst else 0.0,
             factor=self.inflation,
             parts=self.component_rows,
             p_value=self.joint_p_value,
@@ -585,17 +583,6 @@ class PriorConflict:
     def report(self) -> list[Finding]:
         """Return the finding where it says more than that the tolerances agree with the data."""
         return [self.finding] if self.conflict or self.components else []
-
-    @property
-    def _worst(self) -> LargestDeviation | None:
-        """The test of a parameter or direction that is more significant than the one of all."""
-        worst = min(self.parameter, self.direction, key=lambda test: test.p_value)
-        return worst if worst.p_value < self.p_value else None
-
-    @property
-    def sentence(self) -> str:
-        """The text of the finding."""
-        return str(self.finding)
 
 
 def assess_prior_conflict(

@@ -50,13 +50,14 @@ from loopcal.results.deferred import DeferredFields, deferred
 from loopcal.results.description import OTHER, Field, Source, fields, label_axes
 from loopcal.results.presenters import draw
 from loopcal.results.result import TableResult
+from loopcal.results.tables import Column, build_table, format_uncertainty, format_with_uncertainty
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import SI_SYMBOLS, Dimension
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from loopcal.estimate.observation_rows import ObservationRows, Residuals
+    from loopcal.estimate.observation_rows import Residuals
     from loopcal.estimate.pose_estimate import EstimatedPoses
     from loopcal.estimate.prior_inflation import PriorConflict
     from loopcal.estimate.problem import Problem
@@ -148,7 +149,11 @@ def label_residuals(
         KindResiduals(
             kind=s.kind.name,
             components=tuple(column.name for column in s.kind.noise_columns),
-            poses=_label_rows(s, data.labels),
+            # those of the poses that a row observed, or "base"
+            poses=tuple(
+                s.kind.of if s.kind.is_of_base else "/".join(map(data.labels.__getitem__, poses))
+                for poses in s.poses_by_link.tolist()
+            ),
             raw=np.where(measured, r.raw[0], np.nan),
             whitened=r.whitened[0],
             context=columns,
@@ -158,16 +163,6 @@ def label_residuals(
         )
         for s, measured, columns, r in zip(problem.rows, present, context, residuals, strict=True)
     )
-
-
-def _label_rows(rows: ObservationRows, labels: tuple[str, ...]) -> tuple[str, ...]:
-    """Return a label for each row: those of the poses that it observed, or "base"."""
-    poses = rows.poses_by_link
-    if rows.kind.is_of_base:
-        return (rows.kind.of,) * len(poses)
-    if poses.shape[1] == 1:
-        return tuple(map(labels.__getitem__, poses[:, 0].tolist()))
-    return tuple("/".join(labels[i] for i in members) for members in poses.tolist())
 
 
 FAR = 10.0
@@ -524,33 +519,6 @@ class Identification(DeferredFields, TableResult):
             ]
         )
 
-    def __str__(self) -> str:
-        """Return the parameters as a table, the status and the findings."""
-        note = [] if self.interval_note is None else [str(self.interval_note)]
-        lines = [*self._list_values(), *note, ""]
-        lines.append(f"{self.history.finding} {self.describe_statistics()}".rstrip())
-        return "\n".join([*lines, *(f"{f.severity.value}: {f}" for f in self._further_findings)])
-
-    def _list_values(self) -> list[str]:
-        """Return the lines of the table of parameters; last values are no estimates."""
-        width = max(len(name) for name in (*self.names, *self.nuisance.names))
-        rows = (*self.list_parameters(), *self.list_nuisance())
-        if not self.converged:
-            lines = [f"{'parameter':<{width}} {'nominal':>14} {'last value':>14} unit"]
-            for entry in rows:
-                values = (f"{entry[key]:>14.{LAST_DIGITS}g}" for key in ("nominal", "estimate"))
-                lines.append(f"{entry['name']:<{width}} {' '.join(values)} {entry['unit']}")
-            return lines
-        lines = [f"{'parameter':<{width}} {'nominal':>14} {'estimate':>14} {'+/- (95 %)':>12} unit"]
-        for entry in rows:
-            half_width = format_half_width(entry["plus_minus"])
-            decimals, shown = half_width if entry.get("free", True) else (6, "fixed")
-            nominal, estimate = (f"{entry[key]:>14.{decimals}f}" for key in ("nominal", "estimate"))
-            lines.append(
-                f"{entry['name']:<{width}} {nominal} {estimate} {shown:>12} {entry['unit']}"
-            )
-        return lines
-
     def list_fields(self) -> Iterator[Field]:
         """Yield the fields, among them the residuals of each kind (predicted - measured)."""
         yield from self.FIELDS
@@ -572,11 +540,6 @@ class Identification(DeferredFields, TableResult):
     def plot(self) -> FitFigures:
         """The figures of the fit, such as `fit.plot.residuals()`."""
         return FitFigures(self)
-
-    @property
-    def _further_findings(self) -> list[Finding]:
-        """The findings but the status."""
-        return [f for f in self.findings if f.code != self.history.finding.code]
 
     def list_nuisance(self) -> list[dict[str, Any]]:
         """Return one row for each nuisance parameter, with 95 % intervals."""
@@ -786,16 +749,19 @@ class NuisanceEstimate(TableResult):
 
     def __str__(self) -> str:
         """Return one line for each: name, estimate and standard deviation in its unit."""
-        title = "setup parameter"
-        width = max(map(len, (title, *self.names)))
-        lines = [f"{title:<{width}} {'estimate':>14} {'+/- (1 sd)':>12} unit"]
-        for entry, value, sd, (factor, symbol) in zip(
-            self.table.entries, self.estimate, self.sd, self.display, strict=True
-        ):
-            decimals, half = format_half_width(sd / factor) if entry.free else (6, "fixed")
-            number = f"{value / factor:>14.{decimals}f}"
-            lines.append(f"{entry.name:<{width}} {number} {half:>12} {symbol}")
-        return "\n".join(lines) if self.names else "no setup parameters"
+        rows = self.rows(np.ones(len(self)), np.full(len(self), np.inf))
+        table = build_table(
+            "",
+            rows,
+            ("setup parameter", lambda row: row["name"]),
+            (Column("estimate"), lambda row: format_with_uncertainty(row["estimate"], row["sd"])),
+            (
+                Column("+/- (1 sd)"),
+                lambda row: format_uncertainty(row["sd"]) if row["free"] else "fixed",
+            ),
+            ("unit", lambda row: row["unit"]),
+        )
+        return table.to_text() if rows else "no setup parameters"
 
     @classmethod
     def empty(cls, parameters: int) -> NuisanceEstimate:
@@ -963,15 +929,3 @@ def _only_displaces(
 def _owners(names: Iterable[str]) -> list[str]:
     """Return the frames, targets and surfaces to which parameters such as `tracker.x` belong."""
     return list(dict.fromkeys(name.rsplit(".", 1)[0] for name in names))
-
-
-def format_half_width(half: float) -> tuple[int, str]:
-    """Return the decimals that an uncertainty leaves, and the uncertainty with two digits."""
-    if np.isnan(half):
-        return 6, "not given"
-    if np.isinf(half):
-        return 6, "unknown"
-    if half == 0.0:
-        return 6, "0"
-    decimals = int(np.clip(1 - np.floor(np.log10(half)), 0, 12))
-    return decimals, f"{half:.{decimals}f}"

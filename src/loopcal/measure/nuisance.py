@@ -166,8 +166,7 @@ def collect_nuisance_parameters(
         factors.append(
             np.where(kind.is_drift, rows.drift_part[:, None], 1.0) if takes_parts else None
         )
-        _check_names(kind, references)
-        _check_common(kind, common)
+        _check_names(kind, references, common)
         owners = {
             scope: _list_owners(rows, scope, labels)
             for scope in {p.scope for p in kind.nuisance_parameters}
@@ -235,20 +234,10 @@ def _enter(entries: dict[str, Parameter], parameter: Parameter, owner: str, kind
     return name
 
 
-def _check_common(kind: Kind, common: Collection[str]) -> None:
-    """Refuse names of frames, targets and surfaces that all sessions have in common."""
-    for item, of_item in kind.own_items.items():
-        may_be_common = (kind.bias_item, *kind.common_items)
-        for name in (p.name for p in of_item.parameters if item not in may_be_common):
-            if name in common:
-                raise DataError(
-                    f"the scope of {name!r} is all, but sessions share only offsets and common "
-                    "errors of an instrument, such as its scale. Leave it out"
-                )
-
-
-def _check_names(kind: Kind, references: dict[str, FloatArray]) -> None:
-    """Refuse two parameters of one name, and another reference than the kinds before; enter it."""
+def _check_names(kind: Kind, references: dict[str, FloatArray], common: Collection[str]) -> None:
+    """Refuse two parameters of one name, another reference than the kinds before, which it enters,
+    and frames, targets and surfaces that all sessions have in `common`.
+    """
     names = [p.name for p in kind.nuisance_parameters]
     repeated = next((name for name in names if names.count(name) > 1), None)
     if repeated is not None:
@@ -262,3 +251,11 @@ def _check_names(kind: Kind, references: dict[str, FloatArray]) -> None:
                 f"the kind {kind.name!r} gives another orientation or place of {name!r} than the "
                 "kind before. Give them alike, or use another name"
             )
+    for item, of_item in kind.own_items.items():
+        may_be_common = (kind.bias_item, *kind.common_items)
+        for name in (p.name for p in of_item.parameters if item not in may_be_common):
+            if name in common:
+                raise DataError(
+                    f"the scope of {name!r} is all, but sessions share only offsets and common "
+                    "errors of an instrument, such as its scale. Leave it out"
+                )

@@ -295,8 +295,13 @@ def view_fit(fit: Identification) -> list[Block]:
 
 @register("page", Identification)
 def _view_fit_and_findings(fit: Identification) -> list[Block]:
-    """Return the page of a fit, and its findings."""
-    return [*view_fit(fit), *(f"{f.severity.value}: {f}" for f in fit.findings)]
+    """Return the page of a fit, its setup parameters, and its findings."""
+    blocks, local = view_fit(fit), fit.list_nuisance()
+    if local and fit.converged:
+        blocks.append(build_parameter_table("Setup parameters", local))
+    elif local:
+        blocks.append(build_last_value_table(local))
+    return [*blocks, *(f"{f.severity.value}: {f}" for f in fit.findings)]
 
 
 def _describe_iteration(fit: Identification) -> str:

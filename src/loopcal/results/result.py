@@ -19,6 +19,9 @@ if TYPE_CHECKING:
     from loopcal.results.tables import Block, Table
 
 
+UNBROKEN = 1_000_000  # characters of a line that no text has
+
+
 class Result:
     """Base of results that notebooks show as text and tables."""
 
@@ -32,6 +35,13 @@ class Result:
     def page(self) -> list[Block]:
         """Return what a notebook shows: paragraphs and tables."""
         return [str(self)]
+
+    def __str__(self) -> str:
+        """Return the registered page as text, without one the representation."""
+        from loopcal.results.tables import render_text
+
+        own_page = find_presenter("page", type(self))
+        return repr(self) if own_page is None else render_text(own_page(self), UNBROKEN)
 
     def _repr_html_(self) -> str:
         """Return the result as HTML, with at most some 30 rows of each table."""

@@ -10,15 +10,15 @@ import pytest
 from loopcal import geometry, load_robot
 from loopcal.errors import DataError, LoopcalError
 from loopcal.io.data.measurement_file import load_measurements, save_measurements
+from loopcal.measure.instrument import Gaussian, Instrument, Sensor
 from loopcal.measure.kinds.image import (
+    Image,
     calibrate_camera,
     find_rays,
     locate_boards,
     project,
     solve_focal_lengths,
 )
-from loopcal.measure.instrument import Gaussian, Instrument, Sensor
-from loopcal.measure.kinds.image import Image
 from loopcal.measure.simulation import simulate
 
 LENS_VALUES = np.array([3000.0, 3100.0, 2000.0, 1500.0, 0.1, -0.2, 0.05, 0.001, -0.002])
