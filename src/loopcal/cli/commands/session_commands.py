@@ -11,6 +11,7 @@ import click
 
 import loopcal as lc
 from loopcal.cli import options as opt
+from loopcal.cli import terminal
 from loopcal.cli.hints import suggest_command
 from loopcal.cli.terminal import Output
 from loopcal.errors import DataError, FileError
@@ -85,7 +86,11 @@ def measure(
     if speed is not None and minutes is None:
         raise DataError("--speed weighs travel against measuring. Also give --minutes")
     sheet = plan / DATA if plan.is_dir() else plan
-    machine = lc.load_robot(robot or find_plan_robot(sheet)).with_conditions(dict(at))
+    if robot is None:
+        robot, has_changed = find_plan_robot(sheet)
+        if has_changed:
+            terminal.print_finding("session.robot-changed", robot=robot)
+    machine = lc.load_robot(robot).with_conditions(dict(at))
     table, entry = read_sheet(sheet, machine)
     if has_empty_readings(sheet, machine):
         raise FileError("this sheet asks for readings. Fill in the file itself", sheet)
@@ -120,6 +125,5 @@ def measure(
     }
     page = [f"{output}: {len(visits)} rows, {used} used"]
     if used:
-        words = ("calibrate", robot or find_plan_robot(sheet), data, "-o", "run")
-        page.append(suggest_command(*words))
+        page.append(suggest_command("calibrate", robot, data, "-o", "run"))
     return Output(document, lambda: page)

@@ -24,7 +24,7 @@ import numpy as np
 from loopcal.errors import FileError
 from loopcal.io.core.csv_table import format_row, parse_exact
 from loopcal.io.core.outputs import FolderKind
-from loopcal.io.core.text_file import read_json
+from loopcal.io.core.text_file import read_json, sha256
 from loopcal.io.data.columns import COMMANDED, FIT, HELD_OUT, USE_COLUMN
 from loopcal.io.data.measurement_file import format_data_sheet, format_measurements
 from loopcal.mechanism.model import Mechanism
@@ -125,16 +125,18 @@ def _read_plan(sheet: Path) -> Mapping[str, Any]:
     return document if isinstance(document, dict) else {}
 
 
-def find_plan_robot(sheet: Path) -> str:
-    """Return the robot file that a plan was made for; FileError where it is not known."""
-    made_by = _read_plan(sheet).get("made_by", {})
-    path = made_by.get("inputs", {}).get("robot", {}).get("path", "")
+def find_plan_robot(sheet: Path) -> tuple[str, bool]:
+    """Return the robot file that a plan was made for, and whether it has changed since; FileError
+    where it is not known.
+    """
+    file = _read_plan(sheet).get("made_by", {}).get("inputs", {}).get("robot", {})
+    path = str(file.get("path", ""))
     if not Path(path).is_file():
         sentence = "the plan of this sheet does not name its robot file"
         if path:
             sentence = f"the robot file {path} of this plan does not exist"
         raise FileError(f"{sentence}. Name the robot", sheet)
-    return str(path)
+    return path, sha256(path) != file.get("sha256")
 
 
 def find_asked(sheet: Path) -> Mapping[str, Any]:
