@@ -547,7 +547,7 @@ def shorten_rows(rows: FloatArray, width: int) -> FloatArray:
     columns are folded by these alone. The rows as they are where this would not halve the work.
     """
     a, M, w = rows.shape
-    is_used = rows[..., :width].any(axis=0)
+    is_used: BoolArray = np.asarray(np.any(rows[..., :width], axis=0))
     if not is_used.size:
         return rows
     key = is_used @ np.random.default_rng(0).integers(1, 2**40, width)
