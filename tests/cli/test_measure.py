@@ -70,6 +70,7 @@ def wrong(row, by=1.0) -> str:
     return join([row[0], str(float(row[1]) + by), *row[2:]])
 
 
+@pytest.mark.slow
 def test_a_session_becomes_the_input_of_a_calibration(measure, rows, loopcal) -> None:
     printed = measure(
         map(join, rows), "accuracy so far: 90 % of machines", "Next: loopcal calibrate"
@@ -96,6 +97,7 @@ def test_a_wrong_row_is_left_out_and_its_repeat_used(measure, rows) -> None:
     assert wrong(rows[6]).split()[1] in journal  # what was measured is not lost
 
 
+@pytest.mark.slow
 def test_a_row_is_taken_back_used_and_left_out(measure, rows) -> None:
     measure([*map(join, rows[:3]), "back"])
     assert read_used() == [row[0] for row in rows[:2]]
@@ -139,6 +141,7 @@ def test_numbers_are_separated_as_people_write_them(line, name, values) -> None:
     assert split_values(line, 3) == (name, values)
 
 
+@pytest.mark.slow
 def test_a_resumed_session_says_what_an_uninterrupted_one_says(measure, rows) -> None:
     whole = measure(map(join, rows[:6])).out.splitlines()[-8:-2]
     shutil.rmtree("session")
@@ -245,6 +248,7 @@ def test_rows_of_an_export_are_taken(measure, rows, newline, decimal, more) -> N
     assert read_used() == [row[0] for row in rows]
 
 
+@pytest.mark.slow
 def test_an_export_grows_begins_again_and_repeats_rows(rows, monkeypatch, capsys) -> None:
     steps = iter(  # content of the export, and how many rows loopcal then has
         [
