@@ -25,7 +25,8 @@ from loopcal.diagnose.conventions.convention_check import check_conventions
 from loopcal.diagnose.point_names import examine_points
 from loopcal.errors import DataError, FileError
 from loopcal.io.data.measurement_file import format_data_sheet, load_measurements
-from loopcal.io.exports.conversion import fill_sheet, save_converted
+from loopcal.io.exports.conversion import fill_sheet, read_sheet, save_converted
+from loopcal.io.exports.growing_export import GrowingExport, read_new_rows
 from loopcal.io.exports.profile import find_profile_file, read_profile, with_local_settings
 from loopcal.measure.instrument import Gaussian, Instrument, Sensor
 from loopcal.measure.kinds.position import Position
@@ -186,6 +187,30 @@ def test_missing_unknown_and_repeated_points_are_listed(robot, sheet, points, tm
     rows = [row for row in filled.table[1:] if row[0] == "3"]
     assert len(rows) == 2
     assert f"{points[6][1][0] + 0.012:.6f}" in rows[1]
+
+
+@pytest.mark.parametrize("by_order", [False, True])
+def test_a_growing_export_gives_complete_sets_of_targets_once(
+    robot, sheet, points, tmp_path, by_order
+) -> None:
+    lines = [f"{name} {x} {y} {z}\n" for name, (x, y, z) in points]
+    entry = read_sheet(sheet, robot)[1]
+    path = tmp_path / "points.txt"
+    export = GrowingExport(path, read_profile(find_profile_file("leica")), entry, by_order)
+    assert read_new_rows(export).rows == ()  # nothing is written yet
+    found = []
+    for text in ("".join(lines[:2]), "".join(lines[:4]), "".join(lines[:6]) + lines[6][:-3]):
+        path.write_text(text)
+        new = read_new_rows(export)
+        export = new.export
+        found.append([row.get("pose", "") for row in new.rows])
+        assert all(row[f"{target}.z"] for row in new.rows for target in TARGETS)
+    first, second = ("", "") if by_order else (points[0][0][:-5], points[3][0][:-5])
+    assert found == [[], [first], [second]]
+    path.write_text("".join(lines[3:6]))
+    again = read_new_rows(export)
+    assert [finding.code for finding in again.findings] == ["session.export-began-again"]
+    assert len(again.rows) == 1
 
 
 def test_points_sorted_by_target_come_to_their_poses(robot, sheet, points, tmp_path) -> None:
