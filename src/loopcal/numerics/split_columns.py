@@ -81,31 +81,22 @@ class SplitColumns:
 
     def trace_neighbors(self, pairs: IntArray) -> tuple[float, float, float]:
         """Return tr U'LU, tr (LU)'LU and tr (U'LU)^2 of the matrix U; L is symmetric, with 1/2 for
-        each pair of a row (n,) and the next one.
+        each pair of a row (n,), ascending, and the next one.
         """
+        first, second = self.take(pairs), self.take(pairs + 1)
+        between = pairs[1:][np.diff(pairs) == 1]  # rows with two neighbors
+        squares = 0.25 * float((first.squares() + second.squares()).sum())
+        squares += 0.5 * self.take(between - 1).inner(self.take(between + 1))
+        parts = [(first.narrow, second.narrow), (first.wide, second.wide)]
+        product = 0.0  # of U'LU = (A'B + B'A) / 2, rows A and B of the pairs
+        for i, (A, B) in enumerate(parts):
+            for times, (C, D) in zip((1.0, 2.0), reversed(parts[: i + 1]), strict=False):
+                product += times * float(((0.5 * (C.T @ B + D.T @ A)) ** 2).sum())
+        return first.inner(second), squares, product
 
-        def shift(columns: Any) -> Any:
-            """Return L columns (R, c)."""
-            up, down = columns[pairs + 1], columns[pairs]
-            if not hasattr(columns, "tocoo"):
-                moved = np.zeros_like(columns)
-                moved[pairs] += 0.5 * up
-                moved[pairs + 1] += 0.5 * down
-                return moved
-            from scipy import sparse
-
-            n = columns.shape[0]
-            half = sparse.csr_array((np.full(len(pairs), 0.5), (pairs, pairs + 1)), shape=(n, n))
-            return (half + half.T) @ columns
-
-        first, squared, product = 0.0, 0.0, 0.0
-        parts = [(part, shift(part)) for part in (self.narrow, self.wide) if part.shape[1]]
-        for i, (part, moved) in enumerate(parts):
-            first += float((part * moved).sum())
-            squared += float((moved**2).sum())
-            for j, (other, _) in enumerate(parts[: i + 1]):
-                product += (1.0 if i == j else 2.0) * float(((other.T @ moved) ** 2).sum())
-        return first, squared, product
+    def inner(self, other: SplitColumns) -> float:
+        """Return the sum of the products of all entries with those of another matrix."""
+        return float((self.narrow * other.narrow).sum() + (self.wide * other.wide).sum())
 
     def toarray(self) -> FloatArray:
         """Return the matrix (R, s + d)."""
