@@ -242,11 +242,7 @@ def transport_matrix(arm: FloatArray, rotation: FloatArray | None = None) -> Flo
     the new ones (default: base axes).
     """
     turned = np.eye(3) if rotation is None else rotation
-    low = turned @ hat(arm)
-    out = np.zeros((*low.shape[:-2], 6, 6))
-    out[..., :3, :3] = out[..., 3:, 3:] = turned
-    out[..., 3:, :3] = -low
-    return out
+    return stack_blocks(((turned, None), (-(turned @ hat(arm)), turned)))
 
 
 def differentiate_by_frames(T: FloatArray) -> FloatArray:

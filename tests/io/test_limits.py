@@ -250,7 +250,7 @@ def test_counts_on_the_command_line_are_refused_above_their_limit(name, capsys) 
 
 
 def test_every_option_that_takes_a_count_has_a_limit() -> None:
-    """A seed and the number of directions of --keep take no memory."""
+    """A seed, the directions of --keep and the checks of a year take no memory."""
     unlimited, used = set(), set()
     for name in (name for members in SECTIONS.values() for name in members):
         command = find_command(name)
@@ -261,7 +261,7 @@ def test_every_option_that_takes_a_count_has_a_limit() -> None:
                 used.add(option.type.limit)
             elif isinstance(option.type, click.types.IntParamType):
                 unlimited.add(option.name)
-    assert unlimited == {"seed", "keep"}
+    assert unlimited == {"seed", "keep", "a_year"}
     assert used == set(COUNTED)
     assert [getattr(limits, name) for name in COUNTED] == list(limits.COUNT_LIMITS)
 

@@ -422,10 +422,10 @@ class Kind(ABC):
         return None
 
     @cached_property
-    def _is_length(self) -> BoolArray:
+    def _is_length(self) -> tuple[bool, ...]:
         """(u,) which parameters of the kind's own items are lengths."""
         of_items = (p for item in self.own_items.values() for p in item.parameters)
-        return np.array([p.dimension is Dimension.LENGTH for p in of_items], dtype=bool)
+        return tuple(p.dimension is Dimension.LENGTH for p in of_items)
 
     def without_shared_errors(self) -> Self:
         """Return the kind without common errors of the instrument."""
@@ -621,10 +621,11 @@ class Kind(ABC):
             by_angle, by_length = (
                 np.linalg.norm(part, axis=-1) for part in np.split(result.jacobian, 2, axis=-1)
             )
-            reach = float(np.abs(T[..., :3, 3]).max(initial=0.0)) or 1.0
+            reach = np.abs(T[..., :3, 3]).max(initial=0.0)
+            reach = np.where(reach > 0.0, reach, 1.0)
             by_move = np.hypot(by_angle / reach, by_length)
             by_move = by_move.sum(axis=-2) if self.poses_per_row > 1 else by_move
-            size = by_move[..., None] * np.where(self._is_length, 1.0, reach)
+            size = by_move[..., None] * np.where(np.array(self._is_length), 1.0, reach)
             result = result._replace(nuisance=without_rounding(result.nuisance, size))
         if self.of:  # rows of a stage depend on its platform, those of the base on no motion
             by_entries = (

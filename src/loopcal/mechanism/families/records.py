@@ -244,7 +244,10 @@ class CommonErrorRecord:
             example = "Give one, such as `length: {sd: 0.1}`"
             raise refuse(f"has {len(stated)} tolerances. {example}")
         ((dimension, tolerance),) = stated.items()
-        sd = standard_deviation(tolerance, f"common error {self.name!r}")
+        try:
+            sd = standard_deviation(tolerance, f"common error {self.name!r}")
+        except MechanismError as error:
+            raise RecordError(str(error), *at, dimension.value) from None
         assert sd is not None
         matching = match_parameter_names(self.of, [p.name for p in parameters], *at, "of")
         chosen = [parameter for parameter in parameters if parameter.name in matching]
