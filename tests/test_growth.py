@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from loopcal.apply.compensation import compensate
-from loopcal.diagnose import cluster_covariance
-from loopcal.diagnose.cluster_covariance import Clusters, choose_clusters, compute_robust_spread
+from loopcal.diagnose import bootstrap
+from loopcal.diagnose.bootstrap import Clusters, choose_clusters, compute_robust_spread
 from loopcal.diagnose.residual_patterns import ResidualRows
 from loopcal.estimate.fit_linearization import linearize_fit
 from loopcal.estimate.identification import identify
@@ -201,7 +201,7 @@ def test_an_even_choice_of_clusters_stands_for_all(monkeypatch) -> None:
     clusters = Clusters("pose", np.arange(240), 240)
     linear = linearize_fit(fit, data)
     whole = compute_robust_spread(linear, clusters)
-    monkeypatch.setattr(cluster_covariance, "MOST_CLUSTERS", 80)
+    monkeypatch.setattr(bootstrap, "MOST_CLUSTERS", 80)
     chosen, times = choose_clusters(clusters)
     assert (chosen.count, times, int((chosen.member >= 0).sum())) == (80, 3.0, 80)
     part = compute_robust_spread(linear, clusters)

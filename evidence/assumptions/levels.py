@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from loopcal.estimate.false_alarms import FALSE_ALARMS
+from loopcal.estimate.residual_test import FALSE_ALARMS
 
 STATED_LEVELS = {
     "noise.doubtful": FALSE_ALARMS["doubtful noise"],

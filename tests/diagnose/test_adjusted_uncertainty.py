@@ -19,12 +19,12 @@ from loopcal.diagnose.residual_patterns import (
     collect_residual_rows,
     estimate_correlated_errors,
 )
-from loopcal.estimate.false_alarms import FALSE_ALARMS
 from loopcal.estimate.fit_linearization import linearize_fit
 from loopcal.estimate.identification import identify
 from loopcal.estimate.losses import Huber
 from loopcal.estimate.options import FitOptions
 from loopcal.estimate.penalties import LeastSquares
+from loopcal.estimate.residual_test import FALSE_ALARMS
 from loopcal.findings import Severity
 from loopcal.mechanism.sensitivity import differentiate_pose
 from loopcal.mechanism.solutions import forward

@@ -9,8 +9,7 @@ from scipy.linalg import sqrtm
 from scipy.optimize import least_squares
 
 import loopcal as lc
-from loopcal.diagnose.bootstrap import compute_block_errors
-from loopcal.diagnose.cluster_covariance import Clusters
+from loopcal.diagnose.bootstrap import Clusters, compute_block_errors
 from loopcal.errors import EstimationError
 from loopcal.estimate.fit_linearization import linearize_fit
 from loopcal.estimate.identification import identify

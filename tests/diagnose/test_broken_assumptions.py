@@ -12,7 +12,7 @@ from evidence.assumptions.evaluation import evaluate_case, is_met
 from evidence.assumptions.levels import STATED_LEVELS, name_group
 from evidence.assumptions.simulation import describe_noise, simulate_case
 from loopcal import load_robot
-from loopcal.estimate.false_alarms import FALSE_ALARMS
+from loopcal.estimate.residual_test import FALSE_ALARMS
 from loopcal.measure.instrument import Gaussian
 from loopcal.studies.simulation.machines import AlteredNoise
 

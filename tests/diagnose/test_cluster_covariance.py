@@ -12,11 +12,7 @@ import pytest
 from scipy.linalg import sqrtm
 
 from loopcal.diagnose.adjusted_uncertainty import adjust_uncertainty, check_heavy_tails
-from loopcal.diagnose.cluster_covariance import (
-    Clusters,
-    compute_robust_spread,
-    divide_into_clusters,
-)
+from loopcal.diagnose.bootstrap import Clusters, compute_robust_spread, divide_into_clusters
 from loopcal.estimate.fit_linearization import linearize_fit
 from loopcal.estimate.identification import identify
 from loopcal.estimate.options import FitOptions

@@ -16,8 +16,7 @@ from loopcal.diagnose.conventions.interpretations import (
     list_orders,
     list_reading_interpretations,
 )
-from loopcal.diagnose.conventions.misfit import ALLOWED
-from loopcal.diagnose.conventions.selection import select_measured
+from loopcal.diagnose.conventions.misfit import ALLOWED, select_measured
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.measure.instrument import Gaussian, Instrument, Sensor
 from loopcal.measure.kinds.poses import Component, Pose

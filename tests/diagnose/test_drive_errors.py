@@ -16,8 +16,12 @@ from evidence.assumptions.machines import (
     measure_machine,
 )
 from loopcal.apply.accuracy import pose_uncertainty
-from loopcal.diagnose.drive_errors import list_drive_effects, list_units, measure_drive_errors
-from loopcal.diagnose.error_causes import explain_residuals
+from loopcal.diagnose.error_causes import (
+    explain_residuals,
+    list_drive_effects,
+    list_units,
+    measure_drive_errors,
+)
 from loopcal.diagnose.residual_patterns import collect_residual_rows
 from loopcal.estimate.fit_linearization import linearize_fit
 from loopcal.estimate.identification import identify

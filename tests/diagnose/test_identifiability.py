@@ -10,8 +10,11 @@ import pytest
 
 from loopcal.diagnose.identifiable_parameters import compute_observability, identifiability
 from loopcal.errors import EstimationError
-from loopcal.estimate.free_parameters import select_free_parameters
-from loopcal.estimate.null_space import Combination, describe_null_space
+from loopcal.estimate.free_parameters import (
+    Combination,
+    describe_null_space,
+    select_free_parameters,
+)
 from loopcal.findings import Finding
 from loopcal.io.core.text_file import to_json
 from loopcal.io.robot.robot_file import load_robot

@@ -23,12 +23,12 @@ from loopcal.diagnose.model_discrepancy import (
     detect_slow_errors,
     find_slow_errors,
 )
-from loopcal.estimate.false_alarms import FALSE_ALARMS
 from loopcal.estimate.fit_linearization import collect_uncertainty, linearize_fit
 from loopcal.estimate.identification import identify
 from loopcal.estimate.options import FitOptions
 from loopcal.estimate.penalties import MAP, LeastSquares
 from loopcal.estimate.posterior import DISCREPANCY
+from loopcal.estimate.residual_test import FALSE_ALARMS
 from loopcal.estimate.result import Identification
 from loopcal.estimate.smooth_errors import describe_smooth_errors
 from loopcal.measure.instrument import Gaussian, Instrument, Sensor

@@ -8,7 +8,7 @@ import pytest
 from scipy.stats import genpareto, t
 
 import loopcal as lc
-from loopcal.diagnose import posterior_sample
+from loopcal.diagnose import intervals
 from loopcal.diagnose.intervals import (
     effective_size,
     fit_tail_shape,
@@ -196,8 +196,8 @@ def test_proposals_that_run_out_are_reported(monkeypatch) -> None:
     """Tests above assert that nothing is said where the first proposals are good."""
     robot, data = delta(1.0, 60 * UM, 8)
     fit = identify(robot, data, lc.MAP())
-    monkeypatch.setattr(posterior_sample, "ROUNDS", 1)
-    monkeypatch.setattr(posterior_sample, "GOOD_SHARE", 1.01)
+    monkeypatch.setattr(intervals, "ROUNDS", 1)
+    monkeypatch.setattr(intervals, "GOOD_SHARE", 1.01)
     findings = lc.sample_posterior(fit, data, 1000).findings
     assert findings[-1].code == "sampling.proposals-exhausted"
     assert "ended after 1 rounds" in str(findings[-1])

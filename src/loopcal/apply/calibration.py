@@ -36,8 +36,7 @@ from loopcal.diagnose.adjusted_uncertainty import (
     is_explainable,
 )
 from loopcal.diagnose.conventions.convention_check import ConventionCheck, check_conventions
-from loopcal.diagnose.drive_errors import measure_drive_errors
-from loopcal.diagnose.error_causes import explain_residuals
+from loopcal.diagnose.error_causes import explain_residuals, measure_drive_errors
 from loopcal.diagnose.error_frames import BASE, FITTED, RELATIVE
 from loopcal.diagnose.fit_examination import check_start_values, compute_reading_errors, examine_fit
 from loopcal.diagnose.frame_drift import compare_shapes, report_base_targets

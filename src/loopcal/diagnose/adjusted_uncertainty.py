@@ -54,10 +54,9 @@ from loopcal.diagnose.residual_patterns import (
 )
 from loopcal.diagnose.residual_patterns import LEVEL as CORRELATED
 from loopcal.diagnose.residual_patterns import MOST_POSES as EVEN_CHOICE
-from loopcal.estimate.false_alarms import FALSE_ALARMS
 from loopcal.estimate.fit_linearization import FitLinearization
 from loopcal.estimate.posterior import NOISE
-from loopcal.estimate.residual_test import choose_severity
+from loopcal.estimate.residual_test import FALSE_ALARMS, choose_severity
 from loopcal.estimate.result import Identification, add_covariance
 from loopcal.findings import Finding, Quantity, Severity, report_finding
 from loopcal.measure.measurements import Measurements

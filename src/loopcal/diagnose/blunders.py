@@ -35,12 +35,12 @@ from loopcal.diagnose.outliers import (
 )
 from loopcal.errors import LoopcalError
 from loopcal.estimate.elimination import NodeRows, fold_node_rows
-from loopcal.estimate.false_alarms import FALSE_ALARMS
 from loopcal.estimate.fit_descent import estimate_scale_of
 from loopcal.estimate.fit_linearization import FitUncertainty
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.observation_rows import linked_blocks, list_block_labels
 from loopcal.estimate.problem import problem_of
+from loopcal.estimate.residual_test import FALSE_ALARMS
 from loopcal.findings import Finding, report_finding
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.readings import fill_in_reading_sigma

@@ -22,7 +22,7 @@ import numpy as np
 
 from loopcal import engine, geometry
 from loopcal.diagnose.residual_patterns import order_by_time
-from loopcal.estimate.false_alarms import FALSE_ALARMS
+from loopcal.estimate.residual_test import FALSE_ALARMS
 from loopcal.findings import Finding, Quantity, report_finding
 from loopcal.measure.kinds.position import Position
 from loopcal.measure.measurements import Measurements

@@ -22,9 +22,8 @@ import numpy as np
 
 from loopcal import geometry
 from loopcal.errors import MechanismError
-from loopcal.estimate.free_parameters import FreeParameters
+from loopcal.estimate.free_parameters import Combination, FreeParameters
 from loopcal.estimate.linearization import spread_states
-from loopcal.estimate.null_space import Combination
 from loopcal.estimate.result import Identification
 from loopcal.estimate.unfixed_motions import frame_twists
 from loopcal.findings import Finding, report_finding

@@ -20,21 +20,23 @@ from loopcal.diagnose.gauge_freedoms import interpret_combinations, probe_readin
 from loopcal.diagnose.picture_errors import report_picture_scale
 from loopcal.errors import DataError, EstimationError, MechanismError
 from loopcal.estimate.determinable_setup import fix_undetermined_setup
-from loopcal.estimate.free_parameters import FreeParameters, free_only, select_free_parameters
+from loopcal.estimate.free_parameters import (
+    NEGLIGIBLE,
+    Combination,
+    FreeParameters,
+    choose_pivots,
+    describe_direction,
+    describe_null_space,
+    free_only,
+    select_free_parameters,
+    sparsify_basis,
+)
 from loopcal.estimate.information import (
     ObservedPoses,
     collect_information,
     count_equations,
     instrument_factor,
     observe_poses,
-)
-from loopcal.estimate.null_space import (
-    NEGLIGIBLE,
-    Combination,
-    choose_pivots,
-    describe_direction,
-    describe_null_space,
-    sparsify_basis,
 )
 from loopcal.estimate.pose_estimate import find_unclosed_poses
 from loopcal.estimate.posterior import Posterior, compute_posterior

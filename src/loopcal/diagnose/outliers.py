@@ -29,7 +29,6 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from loopcal.errors import LoopcalError
-from loopcal.estimate.false_alarms import FALSE_ALARMS
 from loopcal.estimate.fit_descent import estimate_scale_of, measure_block_distances
 from loopcal.estimate.identification import identify, prepare_fitted_data
 from loopcal.estimate.linearization import LeverageRows, Linearization, PoseSolution, Start
@@ -37,7 +36,12 @@ from loopcal.estimate.losses import Tukey
 from loopcal.estimate.observation_rows import linked_blocks, list_block_labels
 from loopcal.estimate.penalties import decompose_for
 from loopcal.estimate.problem import Problem, problem_of
-from loopcal.estimate.residual_test import FEWEST_DEGREES, SIGNIFICANCE, count_sigma_degrees
+from loopcal.estimate.residual_test import (
+    FALSE_ALARMS,
+    FEWEST_DEGREES,
+    SIGNIFICANCE,
+    count_sigma_degrees,
+)
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
 from loopcal.measure.measurements import Measurements

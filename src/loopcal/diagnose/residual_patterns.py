@@ -24,11 +24,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from loopcal.estimate.false_alarms import FALSE_ALARMS
 from loopcal.estimate.fit_linearization import FitLinearization, linearize_fit
 from loopcal.estimate.identification import prepare_fitted_data
 from loopcal.estimate.linearization import Linearization, PoseSolution
 from loopcal.estimate.problem import Problem
+from loopcal.estimate.residual_test import FALSE_ALARMS
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, Severity, report_finding
 from loopcal.measure.kinds.kind import Kind

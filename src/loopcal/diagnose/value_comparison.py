@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from loopcal.errors import EstimationError, MechanismError, suggest_names
-from loopcal.estimate.null_space import Combination
+from loopcal.estimate.free_parameters import Combination
 from loopcal.estimate.posterior import Posterior
 from loopcal.estimate.residual_test import SIGNIFICANCE
 from loopcal.estimate.result import Identification

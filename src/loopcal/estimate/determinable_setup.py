@@ -17,7 +17,7 @@ from dataclasses import replace
 import numpy as np
 
 from loopcal.errors import LoopcalError, MechanismError
-from loopcal.estimate.null_space import choose_pivots
+from loopcal.estimate.free_parameters import choose_pivots
 from loopcal.estimate.pose_estimate import predict_from_readings
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding

@@ -20,9 +20,8 @@ from loopcal.estimate.fit_descent import (
     get_method,
     report_closure_start,
 )
-from loopcal.estimate.free_parameters import FreeParameters
+from loopcal.estimate.free_parameters import Combination, FreeParameters, describe_null_space
 from loopcal.estimate.linearization import Linearization, PoseEstimates
-from loopcal.estimate.null_space import Combination, describe_null_space
 from loopcal.estimate.observation_rows import Residuals, linked_blocks
 from loopcal.estimate.options import FitOptions
 from loopcal.estimate.penalties import Method, Regularization, describe_regularization

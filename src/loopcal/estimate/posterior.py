@@ -165,7 +165,7 @@ class ModelDiscrepancy:
     errors : phi. root : (p, m) L [SI].
     degrees : (d,) degrees of freedom of the amplitude of each direction.
     directions, variance : (p, p), (p,) of the posterior without the discrepancy.
-    test : (4,) of the map of the errors, see `loopcal.diagnose.residual_map.MapTest`.
+    test : (4,) of the map of the errors, see `loopcal.diagnose.model_discrepancy.MapTest`.
     mean, axes, left : (m,), (m, m), (m,) expected coefficients given the residuals, their principal
         axes and standard deviations; without entries where the map is no proven gain.
     is_corrected : whether the map corrects the poses.

@@ -34,10 +34,10 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from loopcal.estimate.descent import Descent
-from loopcal.estimate.false_alarms import FALSE_ALARMS
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.penalties import HOLD, MAP, Method
 from loopcal.estimate.posterior import INFLATION, TOLERANCES, CovariancePart, find_variance_sources
+from loopcal.estimate.residual_test import FALSE_ALARMS
 from loopcal.estimate.result import Identification, add_covariance
 from loopcal.estimate.tolerance_components import (
     LARGEST_FACTOR,

@@ -30,10 +30,9 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from loopcal.estimate.elimination import NuisanceElimination
-from loopcal.estimate.free_parameters import FreeParameters
+from loopcal.estimate.free_parameters import Combination, FreeParameters, sparsify_basis
 from loopcal.estimate.linearization import Linearization
 from loopcal.estimate.losses import Loss, describe_loss
-from loopcal.estimate.null_space import Combination, sparsify_basis
 from loopcal.estimate.options import FitOptions
 from loopcal.estimate.penalties import Method, Regularization
 from loopcal.estimate.posterior import NOISE, CovariancePart, Posterior, combine_degrees

@@ -17,7 +17,7 @@ import numpy as np
 from loopcal.apply.validation import FEW_ROWS
 from loopcal.diagnose.gauge_freedoms import interpret_combinations, report_undetermined
 from loopcal.errors import EstimationError
-from loopcal.estimate.null_space import describe_null_space
+from loopcal.estimate.free_parameters import describe_null_space
 from loopcal.findings import Finding, Quantity, report_finding
 from loopcal.findings.wording import round_to_digits
 from loopcal.measure.instrument import Instrument

@@ -36,8 +36,12 @@ if TYPE_CHECKING:
     from loopcal.apply.run_comparison import RunComparison
     from loopcal.diagnose.bootstrap import Bootstrap
     from loopcal.diagnose.cross_validation import RegularizationCurve, RegularizationCurves
-    from loopcal.diagnose.intervals import Intervals, JointRegion, SimultaneousIntervals
-    from loopcal.diagnose.posterior_sample import PosteriorSample
+    from loopcal.diagnose.intervals import (
+        Intervals,
+        JointRegion,
+        PosteriorSample,
+        SimultaneousIntervals,
+    )
     from loopcal.mechanism.model import Mechanism
 
 CONFORMITY = "conformity."
@@ -438,7 +442,7 @@ def view_bootstrap(result: Bootstrap, intervals: Intervals | None = None) -> lis
     return _view_draws(f"bootstrap, {drawn}", result, intervals or result.intervals())
 
 
-@register("page", "loopcal.diagnose.posterior_sample:PosteriorSample")
+@register("page", "loopcal.diagnose.intervals:PosteriorSample")
 def view_posterior(sample: PosteriorSample, intervals: Intervals | None = None) -> list[Block]:
     """Return the page of a sampled posterior: effective size, findings, intervals."""
     drawn = f"{len(sample.draws)} weighted draws worth {sample.effective_size:.0f}"

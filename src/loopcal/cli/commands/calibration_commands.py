@@ -687,7 +687,7 @@ def sample(
     data: tuple[Path, ...] = opt.data("[DATA...]", required=False),
     count: int = opt.option(
         "Number of draws.",
-        of="loopcal.diagnose.posterior_sample:sample_posterior",
+        of="loopcal.diagnose.intervals:sample_posterior",
         type=opt.Count("DRAWS", 100),
     ),
     region: bool = opt.flag(
@@ -707,7 +707,7 @@ def sample(
         type=opt.Words("loopcal.diagnose.intervals:Rule"),
     ),
     level: float = LEVEL,
-    seed: int = opt.seed("the random draws", "loopcal.diagnose.posterior_sample:sample_posterior"),
+    seed: int = opt.seed("the random draws", "loopcal.diagnose.intervals:sample_posterior"),
     output: Path | None = DRAWS,
     force: bool = opt.force("the output file"),
     fit_options: lc.FitOptions = opt.FIT,

@@ -24,7 +24,9 @@ import numpy as np
 from loopcal.diagnose.conventions.misfit import (
     ALLOWED,
     BETTER,
+    GROSS,
     MOST_EXCLUDED,
+    UNDECLARED,
     Comparison,
     compare_with_robot,
     compute_fitted_misfit,
@@ -34,13 +36,9 @@ from loopcal.diagnose.conventions.misfit import (
     judge_data,
     list_rms_residuals,
     refine_misfit,
-    select_reached,
-)
-from loopcal.diagnose.conventions.selection import (
-    GROSS,
-    UNDECLARED,
     report_equals,
     search_interpretations,
+    select_reached,
     shares_poses,
 )
 from loopcal.errors import DataError

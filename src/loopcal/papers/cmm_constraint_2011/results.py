@@ -21,7 +21,7 @@ import numpy as np
 from loopcal import geometry
 from loopcal.diagnose.gauge_freedoms import NO_MOTION, SAME_MOTION, sample_motions, weigh_motions
 from loopcal.diagnose.identifiable_parameters import identifiability
-from loopcal.estimate.null_space import Combination
+from loopcal.estimate.free_parameters import Combination
 from loopcal.findings import report_finding
 from loopcal.findings.wording import list_names
 from loopcal.measure.instrument import Gaussian

@@ -54,7 +54,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from loopcal.estimate.null_space import Combination
+    from loopcal.estimate.free_parameters import Combination
 
 Styles = Mapping[str, dict[str, Any]]
 """Label of a series -> color and marker."""
