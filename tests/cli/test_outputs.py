@@ -84,7 +84,7 @@ def test_run_folder_used_as_input_is_not_replaced(loopcal) -> None:
         "run/robot.yaml data.csv -o run --force",
         "robot.yaml pp.csv -o run --force --prior run",
     ):
-        loopcal(f"calibrate {words}", "cannot be replaced", code=1)
+        loopcal(f"calibrate {words}", "would remove the input", code=1)
     loopcal("compensate run pp.csv -o run/robot.yaml --force", IS_INPUT, code=1)
     assert read_all_files() == before
 
