@@ -176,7 +176,7 @@ def test_data_file_with_a_surface_per_group_cannot_state_the_instrument(loopcal,
         ("--accuracy=-5um", "the accuracy goal is -5 um"),
         ("--groups 3", "belong to --measure plane-line"),
         *(
-            (f"--measure plane-line {option}", f"{option.split()[0]} XX")
+            (f"--measure plane-line {option}", f"takes no {option.split()[0]}")
             for option in NO_PLANE_LINE
         ),
         ("--measure plane-line --hold-out 0", "because it fits every point"),
