@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from loopcal import calibrate, geometry, identifiability, identify, load_robot
-from loopcal.diagnose.error_causes import explain_residuals
-from loopcal.diagnose.picture_errors import (
+from loopcal.diagnose.error_causes import (
+    explain_residuals,
     find_print_scale,
     find_swapped_pictures,
     measure_picture_errors,

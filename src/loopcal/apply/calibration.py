@@ -36,19 +36,20 @@ from loopcal.diagnose.adjusted_uncertainty import (
     is_explainable,
 )
 from loopcal.diagnose.conventions.convention_check import ConventionCheck, check_conventions
-from loopcal.diagnose.error_causes import explain_residuals, measure_drive_errors
+from loopcal.diagnose.error_causes import (
+    explain_residuals,
+    find_print_scale,
+    find_swapped_pictures,
+    measure_drive_errors,
+    measure_picture_errors,
+    report_picture_scale,
+)
 from loopcal.diagnose.error_frames import BASE, FITTED, RELATIVE
 from loopcal.diagnose.fit_examination import check_start_values, compute_reading_errors, examine_fit
 from loopcal.diagnose.frame_drift import compare_shapes, report_base_targets
 from loopcal.diagnose.gauge_freedoms import interpret_fit
 from loopcal.diagnose.model_discrepancy import find_dense_regions
 from loopcal.diagnose.outliers import find_outliers
-from loopcal.diagnose.picture_errors import (
-    find_print_scale,
-    find_swapped_pictures,
-    measure_picture_errors,
-    report_picture_scale,
-)
 from loopcal.diagnose.residual_patterns import CAUSE, POSE, linearize_examined
 from loopcal.engine import collect_versions
 from loopcal.errors import DataError, EstimationError

@@ -430,11 +430,7 @@ def describe_scatter(linear: FitLinearization, blocks: Clusters) -> BlockScatter
         few = np.full(p, float(blocks.count - 1))
         return BlockScatter(nan, few, few, nan, unit_sd, noise)
     spread = compute_robust_spread(linear, blocks)
-    ratio, degrees, share, tail = nan.copy(), nan.copy(), nan.copy(), nan.copy()
-    for j, effect in enumerate(np.eye(p)):
-        compared = spread.compare(effect[None])
-        ratio[j], degrees[j] = compared.ratio, compared.degrees
-        share[j], tail[j] = compared.share, compared.p_value
+    ratio, degrees, share, tail = np.array([spread.compare(e[None]) for e in np.eye(p)]).T
     safe = np.where(np.isfinite(degrees) & (share > 0.0), share, 1.0)
     effective = np.where(np.isfinite(degrees), degrees / safe**2, np.inf)
     return BlockScatter(ratio, degrees, effective, tail, unit_sd, noise)

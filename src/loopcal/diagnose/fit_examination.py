@@ -12,7 +12,13 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from loopcal.diagnose.adjusted_uncertainty import HeavyTails, check_heavy_tails
-from loopcal.diagnose.error_causes import OUTLIERS, explain_residuals
+from loopcal.diagnose.error_causes import (
+    OUTLIERS,
+    ZOOMED,
+    explain_residuals,
+    find_swapped_pictures,
+    measure_picture_errors,
+)
 from loopcal.diagnose.error_frames import (
     FITTED,
     compute_mean_squares,
@@ -21,7 +27,6 @@ from loopcal.diagnose.error_frames import (
 )
 from loopcal.diagnose.model_discrepancy import LackOfFit, check_lack_of_fit
 from loopcal.diagnose.outliers import OutlierCheck, find_outliers
-from loopcal.diagnose.picture_errors import ZOOMED, find_swapped_pictures, measure_picture_errors
 from loopcal.diagnose.residual_patterns import CAUSE, linearize_examined
 from loopcal.diagnose.value_comparison import compare_with_truth
 from loopcal.errors import EstimationError

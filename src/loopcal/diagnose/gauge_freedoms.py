@@ -236,7 +236,14 @@ def report_undetermined(
     freedoms = find_gauge_freedoms(free.robot, free.places, free.tolerance, null)
     findings = []
     if is_readings_alone:
-        findings.append(report_readings_gauge(freedoms))
+        others = freedoms.changing - freedoms.has_scale
+        parts = (
+            {"what": "frames", "frames": freedoms.frames, "count": freedoms.count},
+            {"what": "scale", "frames": (), "count": int(freedoms.has_scale)},
+            {"what": "others", "frames": (), "count": others},
+        )
+        kept = tuple(part for part in parts if part["count"])
+        findings.append(report_finding("identifiability.readings-gauge", parts=kept))
     if freedoms.count or freedoms.still:
         harmless: dict[str, Any] = {"count": freedoms.count, "frames": freedoms.frames}
         harmless |= {"still": freedoms.still, "bodies": freedoms.bodies}
@@ -257,18 +264,6 @@ def report_undetermined(
         "where": freedoms.where,
     }
     return [*findings, report_finding(codes[1], **changed)], changing
-
-
-def report_readings_gauge(freedoms: GaugeFreedoms) -> Finding:
-    """Return what open combinations are: the place of frames, the size, and others."""
-    others = freedoms.changing - freedoms.has_scale
-    combinations = (
-        {"what": "frames", "frames": freedoms.frames, "count": freedoms.count},
-        {"what": "scale", "frames": (), "count": int(freedoms.has_scale)},
-        {"what": "others", "frames": (), "count": others},
-    )
-    kept = tuple(part for part in combinations if part["count"])
-    return report_finding("identifiability.readings-gauge", parts=kept)
 
 
 def twist_weights(size: float) -> FloatArray:

@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
+from loopcal.diagnose.error_causes import report_picture_scale
 from loopcal.diagnose.gauge_freedoms import interpret_combinations, probe_readings
-from loopcal.diagnose.picture_errors import report_picture_scale
 from loopcal.errors import DataError, EstimationError, MechanismError
 from loopcal.estimate.determinable_setup import fix_undetermined_setup
 from loopcal.estimate.free_parameters import (

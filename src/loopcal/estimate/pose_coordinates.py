@@ -100,10 +100,18 @@ class PoseCoordinates:
         moves. `follow` tells whether a pose that Newton does not solve is followed along a path,
         `driven` are joints that these readings drive, where they are known.
         """
+        if not self.are_shared:
+            assert begin is not None
+            return self.close_from(values, begin, follow)
         robot, state = self.free.robot, None if begin is None else begin.state
         q = self.readings_at(poses)
         state = forward_trials(robot, values, q, state, follow, driven=driven)
         return PoseStates(state, np.zeros((len(state.T), len(poses), 0)))
+
+    def close_from(self, values: FloatArray, begin: PoseStates, follow: bool) -> PoseStates:
+        """Solve closure where trials do not share poses; measured ones stay as they are."""
+        del values, follow
+        return begin
 
     def limit_step(self, u: FloatArray) -> FloatArray:
         """Return the largest share (a, n), at most 1, of steps u (a, n, k) that is about linear."""
@@ -122,8 +130,9 @@ class PoseCoordinates:
         Derivatives may be left out where those by parameters are not needed.
         """
         q = states.q if states.q.shape[2] else self.readings_at(poses)
-        if by_parameters:
-            return linearize_poses(self.free, values, q, states.state, self.names)
+        if by_parameters or self.count:
+            scale = self.scale[poses] if self.count else None
+            return linearize_poses(self.free, values, q, states.state, self.names, scale)
         none = np.zeros((*states.state.T.shape[:2], 6, 0))
         unmasked = LinearizedPoses(states.state.T, np.zeros(0, dtype=bool), none)
         return mask_unreached(self.free, self.names, q, states.state, unmasked)
@@ -149,19 +158,6 @@ class MeasuredPoses(PoseCoordinates):
         T = self.T if len(self.T) == 1 else self.T[trials]
         T = np.broadcast_to(T, (len(trials), *T.shape[1:]))
         return replace(home, state=replace(home.state, T=T))
-
-    def close(
-        self,
-        values: FloatArray,
-        poses: IntArray,
-        begin: PoseStates | None,
-        follow: bool,
-        driven: DrivenJoints | None = None,
-    ) -> PoseStates:
-        """Return the measured poses as they are."""
-        del values, poses, follow, driven
-        assert begin is not None
-        return begin
 
     def linearize(
         self, values: FloatArray, states: PoseStates, poses: IntArray, by_parameters: bool = True
@@ -191,31 +187,14 @@ class ReadingCoordinates(PoseCoordinates):
         """Return which readings (n, actuators) are not exact."""
         return self.scale[poses] > 0.0
 
-    def close(
-        self,
-        values: FloatArray,
-        poses: IntArray,
-        begin: PoseStates | None,
-        follow: bool,
-        driven: DrivenJoints | None = None,
-    ) -> PoseStates:
+    def close_from(self, values: FloatArray, begin: PoseStates, follow: bool) -> PoseStates:
         """Solve the forward kinematics."""
-        del poses, driven
-        assert begin is not None
         state = forward_trials(self.free.robot, values, begin.q, begin.state, follow)
         return PoseStates(state, begin.q)
 
     def move(self, states: PoseStates, u: FloatArray) -> PoseStates:
         """Move the readings."""
         return replace(states, q=states.q + self.scale * u)
-
-    def linearize(
-        self, values: FloatArray, states: PoseStates, poses: IntArray, by_parameters: bool = True
-    ) -> LinearizedPoses:
-        """Linearize by the implicit function theorem."""
-        del by_parameters
-        scale = self.scale[poses]
-        return linearize_poses(self.free, values, states.q, states.state, self.names, scale)
 
 
 class TwistCoordinates(PoseCoordinates):
@@ -241,17 +220,9 @@ class TwistCoordinates(PoseCoordinates):
             LONGEST_STEP * np.array([1.0] * 3 + [robot.size] * 3)[self.places]
         )
 
-    def close(
-        self,
-        values: FloatArray,
-        poses: IntArray,
-        begin: PoseStates | None,
-        follow: bool,
-        driven: DrivenJoints | None = None,
-    ) -> PoseStates:
+    def close_from(self, values: FloatArray, begin: PoseStates, follow: bool) -> PoseStates:
         """Solve the inverse kinematics of every limb."""
-        del poses, follow, driven
-        assert begin is not None
+        del follow
         return PoseStates(*solve_at_pose(self.free.robot, values, begin.state.T, begin.state))
 
     def move(self, states: PoseStates, u: FloatArray) -> PoseStates:

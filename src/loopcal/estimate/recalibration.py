@@ -21,7 +21,7 @@ from loopcal.estimate.identification import identify
 from loopcal.estimate.options import FitOptions, merge_options
 from loopcal.estimate.penalties import LeastSquares
 from loopcal.estimate.posterior import INFLATION, Posterior, combine_degrees
-from loopcal.estimate.prior import Prior, limb_parameters, prior_from
+from loopcal.estimate.prior import limb_parameters, prior_from
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
 from loopcal.findings.catalog.phrases import MACHINE
@@ -116,15 +116,25 @@ def recalibrate(
         or options with another method, a loss or a prior.
     """
     check_types(robot, data)
-    options = _check_options(merge_options(options))
-    prior = prior_from(earlier)
-    _check_names(robot, prior)
+    options = merge_options(options)
+    if options.method is not None and not isinstance(options.method, LeastSquares):
+        raise EstimationError(
+            f"method is {options.method!r}; recalibration uses LeastSquares(), because the earlier "
+            "calibration replaces the tolerances"
+        )
+    if options.loss is not None or options.prior is not None:
+        name = "loss" if options.loss is not None else "prior"
+        raise EstimationError(f"recalibration takes no {name}. Remove it from the options")
+    prior, free = prior_from(earlier), select_free_parameters(robot)
+    for name in (*prior.names, *free.names):
+        if name not in prior.names or name not in free.names:
+            place = "the earlier run" if name in prior.names else "the robot file"
+            raise EstimationError(report_finding("prior.other-parameters", name=name, place=place))
     names = prior.names if free_limb is None else limb_parameters(robot, free_limb)
     alone = replace(options, method=None, noise="given", allow_fewer_equations=True)
     later = identify(robot, data, options=alone, progress=progress)
     change = assess_change(earlier, later, names, free_limb or MACHINE)
     if free_limb is not None:  # a freed limb is at its tolerances again
-        free = select_free_parameters(robot)
         places = [free.names.index(name) for name in names]
         nominal, tolerance = free.nominal[places], free.tolerance[places]
         prior = prior.without(names).toleranced(names, nominal, tolerance)
@@ -156,28 +166,6 @@ def assess_change(
     shift = changes.estimate_shifts()[0]
     chi_square, degrees, p_value = changes.chi_square, float(changes.degrees), judged.p_value
     return Change(subject, names, shift, chi_square, degrees, p_value, judged.moved, finding)
-
-
-def _check_options(options: FitOptions) -> FitOptions:
-    """Return options for fits with an earlier calibration; refuse those that contradict it."""
-    if options.method is not None and not isinstance(options.method, LeastSquares):
-        raise EstimationError(
-            f"method is {options.method!r}; recalibration uses LeastSquares(), because the earlier "
-            "calibration replaces the tolerances"
-        )
-    if options.loss is not None or options.prior is not None:
-        name = "loss" if options.loss is not None else "prior"
-        raise EstimationError(f"recalibration takes no {name}. Remove it from the options")
-    return options
-
-
-def _check_names(robot: Mechanism, prior: Prior) -> None:
-    """Refuse a prior of another robot."""
-    free = select_free_parameters(robot).names
-    for name in (*prior.names, *free):
-        if name not in prior.names or name not in free:
-            place = "the earlier run" if name in prior.names else "the robot file"
-            raise EstimationError(report_finding("prior.other-parameters", name=name, place=place))
 
 
 # The change of parameters between two calibrations. Each gives rows B e = b + noise without
@@ -366,7 +354,11 @@ def compare_information(first: Posterior, second: Posterior) -> ParameterChanges
     # both deviations from the nominal values of the first
     offset = second.robot.nominal.values[second.places] - first.robot.nominal.values[first.places]
     values = (values[0], values[1] + rows[1] @ offset)
-    scaled = _remove_common_null(rows[0] * unit, rows[1] * unit)
+    scaled = [own * unit for own in rows]
+    # neither determines these directions, each at its own linearization: the small angle between
+    # the two would count as information
+    common = intersect_spaces(find_null_space(scaled[0]), find_null_space(scaled[1]))
+    scaled = [own - (own @ common) @ common.T for own in scaled]
     stacked = np.vstack(scaled)
     u, s, _ = np.linalg.svd(stacked, full_matrices=True)
     rank = int(are_nonzero(s, INDEPENDENT).sum()) if len(s) else 0
@@ -395,14 +387,6 @@ def compare_information(first: Posterior, second: Posterior) -> ParameterChanges
         divide(value[:, None])[:, 0],
         tuple(ErrorPart(divide(error.root), error.degrees) for error in errors),
     )
-
-
-def _remove_common_null(first: FloatArray, second: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return both sets of rows without the directions that neither determines: each has them at its
-    own linearization, and the small angle between the two would count as information.
-    """
-    common = intersect_spaces(find_null_space(first), find_null_space(second))
-    return first - (first @ common) @ common.T, second - (second @ common) @ common.T
 
 
 CAUSE_LEVEL = 0.01  # probability of rejecting the true cause of a change

@@ -134,19 +134,6 @@ class FrameRows:
         return UnfixedMotions(unfixed_motions(factor, self._effect), by_setup)
 
 
-def find_unfixed_motions(
-    problem: Problem, deviation: FloatArray, start: Start
-) -> UnfixedMotions | None:
-    """Return the result of `FrameRows` at deviation (1, p) of one machine."""
-    located = problem.poses.locate(deviation, start)
-    if located is None:
-        return None
-    rows = FrameRows(problem, None if problem.nuisance is None else start.nuisance)
-    divided = problem.rows if problem.is_uncertain else [r.divided() for r in problem.rows]
-    rows.add_rows(divided, located[0][None], located[1], [None] * len(divided))
-    return rows.find_unfixed()
-
-
 def unfixed_motions(factor: FloatArray, effect: float) -> FloatArray:
     """Return the null space (12, k) of a triangular factor (1, 13, 13) of rows by frame motions.
 
@@ -169,7 +156,12 @@ def find_frame_knowledge(
     """Return how the measurements of one machine determine frames, at deviation (1, p); see
     `describe_frames`.
     """
-    found = find_unfixed_motions(problem, deviation, start)
+    found, located = None, problem.poses.locate(deviation, start)
+    if located is not None:
+        rows = FrameRows(problem, None if problem.nuisance is None else start.nuisance)
+        divided = problem.rows if problem.is_uncertain else [r.divided() for r in problem.rows]
+        rows.add_rows(divided, located[0][None], located[1], [None] * len(divided))
+        found = rows.find_unfixed()
     return describe_frames(problem, data, found, prior, linearization, noise)
 
 
