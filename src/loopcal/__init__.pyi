@@ -10,6 +10,7 @@ from .apply.accuracy import simulate_accuracy as simulate_accuracy
 from .apply.calibration import calibrate as calibrate
 from .apply.calibration_options import CalibrationOptions as CalibrationOptions
 from .apply.calibration_report import CalibrationReport as CalibrationReport
+from .apply.calibration_report import Verdict as Verdict
 from .apply.check_up import CheckUp as CheckUp
 from .apply.check_up import check_up as check_up
 from .apply.compensation import Compensation as Compensation
@@ -24,7 +25,6 @@ from .apply.run_comparison import RunComparison as RunComparison
 from .apply.run_comparison import compare_runs as compare_runs
 from .apply.validation import Validation as Validation
 from .apply.validation import validate as validate
-from .apply.verdict import Verdict as Verdict
 from .apply.volume_accuracy import Volume as Volume
 from .apply.volume_accuracy import VolumeAccuracy as VolumeAccuracy
 from .apply.volume_accuracy import bound_errors as bound_errors

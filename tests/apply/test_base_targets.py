@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, kstest
 
 import loopcal as lc
-from loopcal.apply.verdict import Verdict
+from loopcal.apply.calibration_report import Verdict
 from loopcal.diagnose.frame_drift import compare_shapes, estimate_frame_drifts, report_base_targets
 from loopcal.diagnose.gauge_freedoms import interpret_fit
 from loopcal.diagnose.model_discrepancy import check_lack_of_fit

@@ -13,7 +13,7 @@ import loopcal as lc
 from loopcal.apply.calibration import calibrate
 from loopcal.apply.calibration_options import CalibrationOptions
 from loopcal.apply.calibration_report import CalibrationReport
-from loopcal.apply.verdict import Verdict
+from loopcal.apply.calibration_report import Verdict
 from loopcal.estimate.identification import identify
 from loopcal.estimate.losses import Huber
 from loopcal.estimate.options import FitOptions

@@ -7,7 +7,7 @@ import pytest
 import loopcal as lc
 from loopcal.apply.calibration import calibrate
 from loopcal.apply.calibration_options import CalibrationOptions
-from loopcal.apply.verdict import Verdict
+from loopcal.apply.calibration_report import Verdict
 from loopcal.estimate.options import FitOptions
 from loopcal.estimate.penalties import MAP, LeastSquares
 

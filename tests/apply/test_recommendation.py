@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import loopcal as lc
-from loopcal.apply.verdict import Verdict, recommend_values
+from loopcal.apply.calibration_report import Verdict, recommend_values
 from loopcal.diagnose.adjusted_uncertainty import adjust_uncertainty
 from loopcal.diagnose.row_errors import sum_kinds, summarize_kinds
 from loopcal.estimate.identification import identify

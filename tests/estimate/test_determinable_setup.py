@@ -8,7 +8,7 @@ import pytest
 
 import loopcal as lc
 from loopcal import Component, Gaussian, Instrument, Pose, Position, Sensor
-from loopcal.apply.verdict import Verdict
+from loopcal.apply.calibration_report import Verdict
 from loopcal.estimate.determinable_setup import fix_undetermined_setup, report_equal_setup
 from loopcal.io.robot.robot_file import load_robot
 from loopcal.measure.measurements import Measurements

@@ -11,7 +11,7 @@ import pytest
 import loopcal as lc
 from loopcal.diagnose.cross_validation import draw_folds
 from loopcal.diagnose.model_discrepancy import check_lack_of_fit
-from loopcal.measure.repeats import find_repeats
+from loopcal.measure.readings import find_repeats
 from tests import zoo
 from tests.estimate.problems import UM, hexapod, hexapod_poses, tracker
 

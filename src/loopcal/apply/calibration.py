@@ -11,15 +11,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from loopcal.apply.calibration_options import CalibrationOptions, DataSplit, split_data
-from loopcal.apply.calibration_report import CalibrationReport, Provenance
-from loopcal.apply.error_budget import compute_error_budget
-from loopcal.apply.height_errors import map_height_errors
-from loopcal.apply.validation import Validation, validate
-from loopcal.apply.verdict import (
+from loopcal.apply.calibration_report import (
     ALL_POSES,
     FEW_POSES,
     LIMIT_MISSED,
     SEARCH_LEVEL,
+    CalibrationReport,
+    Provenance,
     explains_residuals,
     report_fit,
     report_freedoms,
@@ -27,6 +25,9 @@ from loopcal.apply.verdict import (
     report_unexplained,
     report_validation,
 )
+from loopcal.apply.error_budget import compute_error_budget
+from loopcal.apply.height_errors import map_height_errors
+from loopcal.apply.validation import Validation, validate
 from loopcal.apply.volume_accuracy import VolumeAccuracy, as_volume, bound_errors
 from loopcal.checks import check_choice
 from loopcal.diagnose.adjusted_uncertainty import (

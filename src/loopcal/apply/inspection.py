@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar
 
-from loopcal.apply.verdict import is_readings_alone
+from loopcal.apply.calibration_report import is_readings_alone
 from loopcal.diagnose.gauge_freedoms import report_undetermined
 from loopcal.diagnose.identifiable_parameters import (
     Identifiability,

@@ -34,7 +34,7 @@ from loopcal.measure.data_checks import check_actuators
 from loopcal.measure.kinds.kind import ErrorGroup
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations
-from loopcal.measure.repeats import find_reading_tolerance, find_repeats
+from loopcal.measure.readings import find_reading_tolerance, find_repeats
 from loopcal.mechanism.model import Mechanism
 from loopcal.numerics.statistics import compute_chi_square_quantile
 from loopcal.results.description import Field, fields

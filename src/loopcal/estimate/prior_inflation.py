@@ -64,23 +64,16 @@ from loopcal.numerics.statistics import (
 from loopcal.results.description import Field, fields
 from loopcal.typing import BoolArray, FloatArray
 
+# Odds of each kind of component against none, before the data: parts of one batch and common zeros
+# are frequent, the others less so. With these odds and right tolerances about 1 % of data sets get
+# a component.
 PRIOR_ODDS: Mapping[Kind, float] = {"shift": 0.3, "group": 0.1, "single": 0.1}
-"""Odds of each kind of component against none, before the data: parts of one batch and common zeros
-are frequent, the others less so. With these odds and right tolerances about 1 % of data sets get a
-component.
-"""
-
+# Components that are chosen at most; more say that the stated tolerances are no prior at all.
 MOST_COMPONENTS = 8
-"""Components that are chosen at most; more say that the stated tolerances are no prior at all."""
-
-CYCLES = 4
-"""Cycles in which the variances of the chosen components are optimized in turn."""
-
-WIDEST = 30.0
-"""Factor on an estimated factor up to which its distribution is integrated."""
-
+CYCLES = 4  # cycles in which the variances of the chosen components are optimized in turn
+WIDEST = 30.0  # factor on an estimated factor up to which its distribution is integrated
+# Variances over which the evidence is integrated: factors uniform in their logarithm.
 VARIANCES = np.expm1(2.0 * np.linspace(0.0, np.log(WIDEST), 41)[1:])
-"""Variances over which the evidence is integrated: factors uniform in their logarithm."""
 
 
 class PredictedData(NamedTuple):
@@ -267,14 +260,9 @@ def restate(
     )
 
 
-POWER_QUANTILE = 0.8416212335729143
-"""Normal quantile of the power 0.8."""
-
-WIDE = 5.0
-"""Deviation in tolerances that a test should show; what it could not is reported."""
-
-NAMED = 4
-"""Largest number of parameters that are named."""
+POWER_QUANTILE = 0.8416212335729143  # normal quantile of the power 0.8
+WIDE = 5.0  # deviation in tolerances that a test should show; what it could not is reported
+NAMED = 4  # largest number of parameters that are named
 
 
 def report_undetectable(free: FreeParameters, rows: Decomposition) -> list[Finding]:
@@ -319,11 +307,8 @@ def find_information(size: float, count: int) -> float:
     return ((threshold + POWER_QUANTILE) / size) ** 2
 
 
-ROUNDS = 4
-"""Fits at most until the chosen components are those of the fit."""
-
-SAME_FACTOR = 0.05
-"""Relative change of a component's factor below which the fit is not repeated."""
+ROUNDS = 4  # fits at most until the chosen components are those of the fit
+SAME_FACTOR = 0.05  # relative change of a component's factor below which the fit is not repeated
 
 
 def choose_methods(free: FreeParameters, fit: Descent, method: Method) -> dict[int, MAP]:
@@ -486,20 +471,14 @@ def _divide(decomposition: Decomposition, method: MAP) -> Decomposition:
     return divided.divided(estimate_excess_noise(divided))
 
 
+# Probability that any of the tests rejects tolerances that are right.
 LEVEL = FALSE_ALARMS["tolerances"]
-"""Probability that any of the tests rejects tolerances that are right."""
-
-FAR = 2.0
-"""Deviation from nominal, in tolerances, above which a parameter is named."""
-
-NAMED_FARTHEST = 3
-"""Largest number of parameters that are named."""
-
+FAR = 2.0  # deviation from nominal, in tolerances, above which a parameter is named
+NAMED_FARTHEST = 3  # largest number of parameters that are named
+# Part of a parameter in a direction, relative to the largest, above which it is named.
 MAIN_PART = 0.3
-"""Part of a parameter in a direction, relative to the largest, above which it is named."""
-
+# Share of the prior variance that data must explain for a parameter or direction to be tested.
 TESTABLE = 1e-6
-"""Share of the prior variance that data must explain for a parameter or direction to be tested."""
 
 
 @dataclass(frozen=True)

@@ -49,6 +49,7 @@ from loopcal.results.deferred import DeferredFields, deferred
 from loopcal.results.description import OTHER, Field, Source, fields, label_axes
 from loopcal.results.presenters import draw
 from loopcal.results.result import TableResult
+from loopcal.results.storage import restore_arrays, store_arrays
 from loopcal.results.tables import Column, build_table, format_uncertainty, format_with_uncertainty
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import SI_SYMBOLS, Dimension
@@ -83,13 +84,17 @@ class KindResiduals:
     dimensions: tuple[Dimension, ...] = ()
     readings: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
 
+    # first words of the names of stored arrays, beside those of the context; `rows` are labels
+    FIELDS: ClassVar[tuple[Field, ...]] = (
+        Field("residual", "raw", is_stored=True),
+        *(Field(n, is_stored=True) for n in ("whitened", "components", "dimensions", "readings")),
+        Field("rows", "poses", is_stored=True),
+    )
+
     def __repr__(self) -> str:
         """Return the kind and the size of the residuals."""
         return f"<KindResiduals of {self.kind}: {len(self.raw)} rows of {len(self.components)}>"
 
-
-OWN = ("residual", "whitened", "components", "dimensions", "rows", "readings")
-"""First words of the names of stored arrays, beside those of the context; `rows` are labels."""
 
 _NAME = re.compile(r"residual_(\d+)_(.+)", re.DOTALL)
 
@@ -98,40 +103,27 @@ def store_residuals(residuals: Sequence[KindResiduals]) -> dict[str, np.ndarray]
     """Return residuals by name, `<what>_<i>_<kind>`; a quantity of the context keeps its name."""
     stored: dict[str, np.ndarray] = {}
     for i, r in enumerate(residuals):
-        dimensions = np.array([dimension.value for dimension in r.dimensions], str)
-        components, labels = np.array(r.components, str), np.array(r.poses, str)
-        named = (r.raw, r.whitened, components, dimensions, labels, r.readings)
-        arrays = {**r.context, **dict(zip(OWN, named, strict=True))}
-        stored |= {f"{name}_{i}_{r.kind}": array for name, array in arrays.items()}
+        ending = f"_{i}_{r.kind}"
+        stored |= {name + ending: array for name, array in r.context.items()}
+        stored |= store_arrays(r, "", ending)
     return stored
 
 
 def residuals_from_arrays(arrays: Mapping[str, np.ndarray]) -> tuple[KindResiduals, ...]:
     """Return the residuals in the arrays of a run folder; none where an older version wrote it."""
     matches = [match for name in arrays if (match := _NAME.fullmatch(name))]
-    result = []
+    others, result = (*(field.name for field in KindResiduals.FIELDS), "fitted_"), []
     for match in sorted(matches, key=lambda m: int(m[1])):
         ending = f"_{match[1]}_{match[2]}"
-        own = {name: arrays.get(name + ending) for name in OWN}
-        if any(array is None for array in own.values()):
+        context = {
+            name.removesuffix(ending): array
+            for name, array in arrays.items()
+            if name.endswith(ending) and not name.startswith(others)
+        }
+        given = {"kind": match[2], "context": context}
+        if (restored := restore_arrays(KindResiduals, arrays, "", ending, **given)) is None:
             return ()
-        raw, whitened, components, dimensions, labels, readings = (arrays[n + ending] for n in OWN)
-        result.append(
-            KindResiduals(
-                kind=match[2],
-                components=tuple(components.tolist()),
-                poses=tuple(labels.tolist()),
-                raw=raw,
-                whitened=whitened,
-                context={
-                    name.removesuffix(ending): array
-                    for name, array in arrays.items()
-                    if name.endswith(ending) and not name.startswith((*OWN, "fitted_"))
-                },
-                dimensions=tuple(Dimension(value) for value in dimensions.tolist()),
-                readings=readings,
-            )
-        )
+        result.append(restored)
     return tuple(result)
 
 
@@ -164,14 +156,10 @@ def label_residuals(
     )
 
 
+# Deviation from nominal, in stated tolerances (standard deviations), that contradicts the
+# tolerance; noise alone does not cause it.
 FAR = 10.0
-"""Deviation from nominal, in stated tolerances (standard deviations), that contradicts the
-tolerance; noise alone does not cause it.
-"""
-
-LOW_WEIGHT = 0.5
-"""Weight of a pose below which it is named."""
-
+LOW_WEIGHT = 0.5  # weight of a pose below which it is named
 STATUS_CODES = {
     DescentStatus.CONVERGED: "fit.converged",
     DescentStatus.OUT_OF_ITERATIONS: "fit.out-of-iterations",
@@ -263,8 +251,7 @@ def report_unknown_bias(
     ]
 
 
-LAST_DIGITS = 3
-"""Digits of the values at which an iteration ended that did not converge."""
+LAST_DIGITS = 3  # digits of the values at which an iteration ended that did not converge
 
 
 @dataclass(frozen=True, eq=False)
@@ -689,12 +676,11 @@ def _add_to_nuisance(
     return replace(nuisance, sd=np.sqrt(nuisance.sd**2 + added))
 
 
+# Share of all that the machine does to a nuisance parameter below which a direction does not move
+# it: rounding.
 SMALLEST_EFFECT = 1e-7
-"""Share of all that the machine does to a nuisance parameter below which a direction does not move
-it: rounding."""
-
+# Standard deviation [m] or [rad] that stands for that of a direction that no row determines.
 UNDETERMINED = 1.0
-"""Standard deviation [m] or [rad] that stands for that of a direction that no row determines."""
 
 
 @dataclass(frozen=True, eq=False)

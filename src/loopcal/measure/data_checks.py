@@ -22,8 +22,12 @@ from loopcal.measure.kinds.joints import JointSensor
 from loopcal.measure.kinds.kind import Kind
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations
-from loopcal.measure.readings import list_joint_dimensions, resolve_reading_sigma
-from loopcal.measure.repeats import find_copies, find_reading_tolerance
+from loopcal.measure.readings import (
+    find_copies,
+    find_reading_tolerance,
+    list_joint_dimensions,
+    resolve_reading_sigma,
+)
 from loopcal.mechanism.model import Mechanism
 from loopcal.numerics.statistics import compute_known_median, compute_median, find_distinct
 from loopcal.typing import BoolArray, FloatArray, IntArray

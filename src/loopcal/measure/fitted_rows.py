@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from loopcal.measure.measurements import Measurements
-from loopcal.measure.repeats import find_steps
+from loopcal.measure.readings import find_steps
 from loopcal.numerics.distributions import binomial_tail
 from loopcal.typing import BoolArray, FloatArray
 

@@ -23,8 +23,12 @@ from loopcal.measure.array_checks import (
 from loopcal.measure.kinds.kind import Kind
 from loopcal.measure.nuisance import NuisanceParameters, StatedValue, collect_nuisance_parameters
 from loopcal.measure.observations import Observations
-from loopcal.measure.readings import check_reading_sigma, weight_reading_sigma
-from loopcal.measure.repeats import find_reading_tolerance, find_repeats
+from loopcal.measure.readings import (
+    check_reading_sigma,
+    find_reading_tolerance,
+    find_repeats,
+    weight_reading_sigma,
+)
 from loopcal.numerics.elimination import find_connected_groups
 from loopcal.numerics.statistics import find_distinct
 from loopcal.results.description import Field, label_axes
@@ -218,7 +222,7 @@ class Measurements(TableResult):
 
     @cached_property
     def repeats(self) -> IntArray:
-        """(n,) number of the pose that each pose repeats, see `loopcal.measure.repeats`."""
+        """(n,) number of the pose that each pose repeats, see `loopcal.measure.readings`."""
         readings, sigma = self.readings, self.reading_sigma
         return find_repeats(readings, find_reading_tolerance(readings, self.observations, sigma))
 

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from loopcal.engine import State
 from loopcal.errors import DataError
 from loopcal.findings import report_finding
-from loopcal.measure.array_checks import check_array, check_type
+from loopcal.measure.array_checks import check_array, check_type, refuse_first
 from loopcal.measure.data_checks import check_closure, check_kinds
 from loopcal.measure.initial_values import EvaluatedRows, evaluate_measurements
 from loopcal.measure.instrument import Distribution, Instrument, Seed, make_random_stream
@@ -355,14 +355,15 @@ def simulate(
     check_type(robot, Mechanism, "robot", "from loopcal.load_robot")
     how = (controller, nuisance_values, reading_sigma, NO_DISTURBANCE, pose_names)
     trials = simulate_trials(robot, robot.values[None], poses, instrument, seed, *how)
-    failed = np.flatnonzero(~trials.reached[0])
-    if len(failed):
-        name = name_pose(int(failed[0]), *pose_names)
-        raise DataError(
-            f"the true machine does not reach pose {name} with the readings of the controller "
-            f"({len(failed)} of {len(trials.readings)} poses fail). Choose poses further inside "
-            "the workspace, or smaller errors"
-        )
+    failed = ~trials.reached[0]
+    refuse_first(
+        failed,
+        lambda i: (
+            f"the true machine does not reach pose {name_pose(i, *pose_names)} with the readings "
+            f"of the controller ({failed.sum()} of {len(failed)} poses fail). Choose poses further "
+            "inside the workspace, or smaller errors"
+        ),
+    )
     return trials.trial(0)
 
 
@@ -375,13 +376,13 @@ def replace_measured_values(
     instrument : a sensor with its noise for each of `data.all_observations`, in their order.
     """
     nominal = forward(robot.nominal, data.readings)
-    failed = np.flatnonzero(~nominal.converged)
-    if len(failed):
-        first = int(failed[0])
-        raise DataError(
-            f"{robot.name} does not reach pose {data.labels[first]!r} with its readings "
-            f"({nominal.explain(first)}). Correct the readings"
-        )
+    refuse_first(
+        ~nominal.converged,
+        lambda i: (
+            f"{robot.name} does not reach pose {data.labels[i]!r} with its readings "
+            f"({nominal.explain(i)}). Correct the readings"
+        ),
+    )
     sensors = tuple(
         replace(sensor, rows=rows.rows, session=rows.session, group=rows.group)
         for sensor, rows in zip(instrument.sensors, data.all_observations, strict=True)
@@ -477,15 +478,14 @@ def _command(
     """Return readings (n, a) and true poses (n, 4, 4) at commanded coordinates (n, c)."""
     controller = inverse(robot.nominal, commanded)
     true = forward(robot, controller.q)
-    lost = np.flatnonzero(~(controller.converged & true.converged))
-    if len(lost):
-        first = int(lost[0])
-        solution = true if controller.converged[first] else controller
-        raise DataError(
-            f"{robot.name} does not reach pose {sheet.labels[first]!r} "
-            f"({solution.explain(first)}). Simulate smaller errors, or plan the points closer to "
-            "the middle of the workspace"
-        )
+    refuse_first(
+        ~(controller.converged & true.converged),
+        lambda i: (
+            f"{robot.name} does not reach pose {sheet.labels[i]!r} "
+            f"({(true if controller.converged[i] else controller).explain(i)}). Simulate smaller "
+            "errors, or plan the points closer to the middle of the workspace"
+        ),
+    )
     return controller.q, true.T
 
 

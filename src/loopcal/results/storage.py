@@ -68,25 +68,36 @@ def _list_stored(of_class: type[Any]) -> list[Field]:
     return [Field(name) for name, hint in hints.items() if find_array_type(hint)]
 
 
-def store_arrays(result: Any, prefix: str) -> dict[str, np.ndarray]:
-    """Return the stored fields of a result, by name after `prefix`."""
+def store_arrays(result: Any, prefix: str, suffix: str = "") -> dict[str, np.ndarray]:
+    """Return the stored fields of a result, by name between `prefix` and `suffix`."""
     stored = _list_stored(type(result))
-    return {prefix + field.name: np.asarray(field.get(result)) for field in stored}
+    return {f"{prefix}{field.name}{suffix}": _to_array(field.get(result)) for field in stored}
+
+
+def _to_array(value: Any) -> np.ndarray:
+    """Return an array; members of an enumeration as their values."""
+    if isinstance(value, tuple) and all(isinstance(entry, Enum) for entry in value):
+        return np.array([entry.value for entry in value], str)
+    return np.asarray(value)
 
 
 def restore_arrays(
-    of_class: type[Stored], arrays: Mapping[str, np.ndarray], prefix: str, **given: Any
+    of_class: type[Stored],
+    arrays: Mapping[str, np.ndarray],
+    prefix: str,
+    suffix: str = "",
+    **given: Any,
 ) -> Stored | None:
     """Return an object from what `store_arrays` returned; None where an array is missing.
 
     given : the attributes that are not stored.
     """
     stored = _list_stored(of_class)
-    if any(prefix + field.name not in arrays for field in stored):
+    if any(f"{prefix}{field.name}{suffix}" not in arrays for field in stored):
         return None
     hints = get_type_hints(of_class)
     for field in stored:
-        attribute, array = str(field.of or field.name), arrays[prefix + field.name]
+        attribute, array = str(field.of or field.name), arrays[f"{prefix}{field.name}{suffix}"]
         is_array = find_array_type(hints[attribute])
         given[attribute] = array if is_array else _restore_value(hints[attribute], array.tolist())
     return of_class(**given)

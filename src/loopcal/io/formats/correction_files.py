@@ -13,8 +13,6 @@ Klipper's "Bed mesh" and its module bed_mesh; RepRapFirmware's Grid; LinuxCNC's 
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -31,6 +29,7 @@ from loopcal.io.formats.program_format import (
     format_short,
 )
 from loopcal.mechanism.platform_coordinates import get_dimension
+from loopcal.results.tables import Column, make_table
 from loopcal.typing import FloatArray
 from loopcal.units import UNITS, Dimension
 
@@ -48,16 +47,13 @@ def write_grid(source: ExportSource, into: Path | None) -> Exported:
     del into
     (table,), robot = source.tables, source.robot
     units = {name: robot.get_unit(get_dimension(name)) for name in (*table.axes, *table.values)}
-    stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
-    names = [f"{name} [{units[name]}]" for name in table.axes]
-    writer.writerow([*names, *(f"add {name} [{units[name]}]" for name in table.values)])
+    parts = (("", table.axes), ("add ", table.values))
+    titles = [Column(f"{add}{name}", str(units[name])) for add, of in parts for name in of]
     places = np.meshgrid(*table.axes.values(), indexing="ij")
     columns = [*zip(table.axes, places, strict=True), *table.values.items()]
     cells = [(values / units[name].factor_to_si).ravel() for name, values in columns]
-    for row in zip(*cells, strict=True):
-        writer.writerow([f"{0.0 + number:.{DIGITS}g}" for number in row])
-    return Exported(stream.getvalue())
+    rows = ([f"{0.0 + number:.{DIGITS}g}" for number in row] for row in zip(*cells, strict=True))
+    return Exported(make_table("", titles, rows).to_csv())
 
 
 def _get_heights(source: ExportSource) -> tuple[FloatArray, FloatArray, FloatArray]:

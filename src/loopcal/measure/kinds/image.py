@@ -31,7 +31,6 @@ from loopcal.measure.kinds import setup_parameters as setup
 from loopcal.measure.kinds.kind import Column, Evaluation, InvalidRows, Kind, checked, list_rows
 from loopcal.numerics.elimination import eliminate_columns
 from loopcal.numerics.statistics import choose_evenly
-from loopcal.parameters import Parameter
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension, Length, Pixel, Ratio
 
@@ -386,15 +385,10 @@ class Image(Kind):
     @classmethod
     def examples(cls) -> tuple[Self, ...]:
         """Return a known camera, one of which all is unknown, and one on the platform."""
-        ahead = geometry.make_pose(
-            geometry.exp_so3(np.array([0.3, -0.2, 0.1])), np.array([0.3, 0.4, -1.1])
-        )
-        board = geometry.make_pose(
-            geometry.exp_so3(np.array([0.2, 0.3, -0.1])), np.array([-0.05, 0.02, 0.1])
-        )
-        wide = geometry.make_pose(
-            geometry.exp_so3(np.array([0.3, -0.2, 0.1])), np.array([0.1, 0.1, 2.2])
-        )
+        twice = np.array([0.3, -0.2, 0.1])
+        rotations = geometry.exp_so3(np.array([twice, [0.2, 0.3, -0.1], twice]))
+        places = np.array([[0.3, 0.4, -1.1], [-0.05, 0.02, 0.1], [0.1, 0.1, 2.2]])
+        ahead, board, wide = geometry.make_pose(rotations, places)
         focal = (1500.0, 1510.0)
         some = cls(unknown=cls.allowed_unknown, focal=focal, corners=(3, 2), square=0.1)
         return (
@@ -434,28 +428,18 @@ class Image(Kind):
     @cached_property
     def possible_setup(self) -> Mapping[str, setup.SetupItem]:
         """The poses of camera and board, the lens, and the print."""
-        numbers = dict[str, float](zip(LENS, self.nominal_lens.tolist(), strict=True))
-        lens, pixel, ratio = self.lens or self.camera, Dimension.PIXEL, Dimension.RATIO
-        items = {
-            item: setup.SetupItem(
-                tuple(
-                    Parameter(
-                        f"{lens}.{n}",
-                        pixel if n in LENS[:4] else ratio,
-                        numbers[n],
-                        scope="session",
-                    )
-                    for n in names
-                )
-            )
+        lens, ratio = self.lens or self.camera, Dimension.RATIO
+        numbers = {
+            item: (lens, names, Dimension.PIXEL if item in ("focal", "center") else ratio, nominal)
             for item, names in LENS_ITEMS.items()
+            for nominal in (self.nominal_lens[[LENS.index(name) for name in names]],)
         }
+        numbers["print"] = (self.board, PRINT, ratio, np.zeros(len(PRINT)))
+        numbers["bend"] = (self.board, BEND, Dimension.LENGTH, np.zeros(len(BEND)))
         return {
             "camera": setup.make_frame_item(self.camera, self.T_camera),
             "board": setup.make_frame_item(self.board, self.T_board),
-            **items,
-            "print": setup.SetupItem(setup.make_parameters(self.board, PRINT, ratio)),
-            "bend": setup.SetupItem(setup.make_parameters(self.board, BEND, Dimension.LENGTH)),
+            **{item: setup.SetupItem(setup.make_parameters(*of)) for item, of in numbers.items()},
         }
 
     def list_labels(self, r: int) -> FloatArray:

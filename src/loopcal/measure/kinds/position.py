@@ -346,8 +346,7 @@ class Position(TargetKind):
 
     def _check_extent(self, positions: FloatArray) -> None:
         """Refuse positions (q, 3) from which an unknown frame does not follow."""
-        extent = np.linalg.svd(positions - positions.mean(axis=0), compute_uv=False)
-        if extent[1] <= FLATNESS * extent[0]:
+        if _are_collinear(positions):
             raise DataError(
                 f"the {len(positions)} positions are collinear, so the rotation of the frame "
                 f"{self.frame!r} about their line stays open. Measure poses off the "
@@ -361,8 +360,13 @@ class Position(TargetKind):
         """
         if not self.is_of_base or self.places is None or "frame" not in self.unknown:
             return False
-        extent = np.linalg.svd(self.places - self.places.mean(axis=0), compute_uv=False)
-        return len(self.places) > 2 and bool(extent[1] > FLATNESS * extent[0])
+        return len(self.places) > 2 and not _are_collinear(self.places)
+
+
+def _are_collinear(points: FloatArray) -> bool:
+    """Return whether points (q, 3) are on a line."""
+    extent = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    return bool(extent[1] <= FLATNESS * extent[0])
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)

@@ -24,7 +24,6 @@ from loopcal.measure.kinds.directions import UPWARD
 from loopcal.measure.kinds.distance import measure_lengths
 from loopcal.measure.kinds.kind import Column, checked
 from loopcal.measure.kinds.position import Prediction, TargetKind
-from loopcal.parameters import Parameter
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension, Length
 
@@ -65,16 +64,14 @@ class SurfaceKind(TargetKind):
     def possible_setup(self) -> Mapping[str, setup.SetupItem]:
         """Also the surface, whose parameters the rows of one group share."""
         stated = {f"{self.surface}.through": self.through, f"{self.surface}.along": self.along}
-        parameters = tuple(
-            Parameter(
-                f"{self.surface}.{axis}",
-                Dimension.ANGLE if axis in setup.DIRECTION_AXES else Dimension.LENGTH,
-                value,
-                scope="group",
-            )
-            for axis, value in zip(self.surface_axes, self.nominal_surface.tolist(), strict=True)
+        k = len([axis for axis in self.surface_axes if axis in setup.DIRECTION_AXES])  # come first
+        numbers = ((Dimension.ANGLE, slice(k)), (Dimension.LENGTH, slice(k, None)))
+        own, nominal = self.surface_axes, self.nominal_surface
+        parameters = (
+            setup.make_parameters(self.surface, own[of], dimension, nominal[of], "group")
+            for dimension, of in numbers
         )
-        return {**super().possible_setup, "surface": setup.SetupItem(parameters, stated)}
+        return {**super().possible_setup, "surface": setup.SetupItem(sum(parameters, ()), stated)}
 
     def guess_values(self, T: FloatArray, measured: FloatArray) -> FloatArray:
         """Return the surface in closed form, with the targets at their stated places."""

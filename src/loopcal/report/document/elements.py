@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
+from loopcal.apply.calibration_report import Verdict
 from loopcal.apply.height_errors import HeightErrors
 from loopcal.apply.validation import Validation
-from loopcal.apply.verdict import Verdict
 from loopcal.estimate.options import OBJECT, FitOptions
 from loopcal.estimate.posterior import Posterior
 from loopcal.estimate.result import KindResiduals

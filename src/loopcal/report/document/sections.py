@@ -10,9 +10,9 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
+from loopcal.apply.calibration_report import Verdict
 from loopcal.apply.error_budget import LENGTHS
 from loopcal.apply.run_comparison import RunComparison
-from loopcal.apply.verdict import Verdict
 from loopcal.engine import collect_versions
 from loopcal.errors import DataError, suggest_names
 from loopcal.findings import sort_by_importance

@@ -22,7 +22,7 @@ from loopcal import geometry
 from loopcal.apply.accuracy import combine_errors, expand_length, pose_uncertainty, transport
 from loopcal.apply.calibration import calibrate
 from loopcal.apply.calibration_options import CalibrationOptions
-from loopcal.apply.verdict import Verdict
+from loopcal.apply.calibration_report import Verdict
 from loopcal.diagnose.adjusted_uncertainty import adjust_uncertainty
 from loopcal.diagnose.error_frames import FITTED, ReferencePoses, fit_frames, refer_errors
 from loopcal.diagnose.gauge_freedoms import twist_weights
