@@ -17,8 +17,8 @@ import loopcal as lc
 from loopcal.apply import calibration
 from loopcal.apply.calibration import calibrate
 from loopcal.apply.calibration_options import CalibrationOptions, split_data
-from loopcal.apply.conformity import STATED
 from loopcal.apply.calibration_report import Verdict, choose_next_step, decide_verdict
+from loopcal.apply.conformity import STATED
 from loopcal.cli.entry_point import main
 from loopcal.errors import DataError, EstimationError
 from loopcal.estimate import fit_linearization

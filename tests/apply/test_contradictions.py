@@ -12,9 +12,8 @@ import numpy as np
 import pytest
 
 import loopcal as lc
-from loopcal.apply.calibration_report import CalibrationReport
+from loopcal.apply.calibration_report import LIMIT_MISSED, CalibrationReport, Verdict
 from loopcal.apply.conformity import Conformity
-from loopcal.apply.calibration_report import LIMIT_MISSED, Verdict
 from loopcal.diagnose.fit_examination import StartVerdict
 from loopcal.estimate.residual_test import LEVEL, SIGNIFICANCE
 from loopcal.findings import Severity

@@ -12,8 +12,7 @@ import pytest
 import loopcal as lc
 from loopcal.apply.calibration import calibrate
 from loopcal.apply.calibration_options import CalibrationOptions
-from loopcal.apply.calibration_report import CalibrationReport
-from loopcal.apply.calibration_report import Verdict
+from loopcal.apply.calibration_report import CalibrationReport, Verdict
 from loopcal.estimate.identification import identify
 from loopcal.estimate.losses import Huber
 from loopcal.estimate.options import FitOptions

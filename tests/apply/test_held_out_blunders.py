@@ -9,8 +9,8 @@ import pytest
 
 from loopcal.apply.calibration import calibrate
 from loopcal.apply.calibration_options import CalibrationOptions
-from loopcal.apply.validation import validate
 from loopcal.apply.calibration_report import Verdict
+from loopcal.apply.validation import validate
 from loopcal.diagnose.blunders import check_held_out_rows
 from loopcal.estimate.fit_linearization import collect_uncertainty
 from loopcal.estimate.identification import identify

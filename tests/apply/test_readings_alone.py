@@ -13,8 +13,8 @@ import pytest
 from scipy.optimize import least_squares
 
 import loopcal as lc
-from loopcal.apply.inspection import analyze_identifiability
 from loopcal.apply.calibration_report import Verdict
+from loopcal.apply.inspection import analyze_identifiability
 from loopcal.diagnose.gauge_freedoms import find_gauge_freedoms
 from loopcal.errors import DataError, FileError
 from loopcal.estimate.identification import identify

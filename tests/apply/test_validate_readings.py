@@ -8,8 +8,8 @@ import pytest
 
 from loopcal.apply.calibration import calibrate
 from loopcal.apply.calibration_options import CalibrationOptions, split_data
-from loopcal.apply.validation import validate
 from loopcal.apply.calibration_report import Verdict
+from loopcal.apply.validation import validate
 from loopcal.errors import DataError, FileError
 from loopcal.estimate.identification import identify
 from loopcal.estimate.options import FitOptions

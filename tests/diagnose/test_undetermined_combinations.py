@@ -9,8 +9,8 @@ import pytest
 
 import loopcal as lc
 from loopcal import Gaussian, Instrument, Pose, Sensor
-from loopcal.apply.inspection import analyze_identifiability
 from loopcal.apply.calibration_report import Verdict
+from loopcal.apply.inspection import analyze_identifiability
 from loopcal.findings import Quantity
 from loopcal.io.robot.robot_file import list_shipped_robots, load_robot
 from loopcal.measure.measurements import Measurements

@@ -388,9 +388,7 @@ def test_poses_in_one_plane_give_unidentifiable_combinations_or_a_refusal(kind):
     except LoopcalError as error:
         refused = str(error)
     if found is None:
-        assert any(
-            words in refused for words in ("from points in one plane", "are one rotation")
-        )
+        assert any(words in refused for words in ("from points in one plane", "are one rotation"))
         return
     assert found.rank < found.n_parameters
     assert len(found.unidentifiable) == found.n_parameters - found.rank
