@@ -208,8 +208,7 @@ def is_readings_alone(data: Measurements) -> bool:
     return all(isinstance(rows.kind, Closure) for rows in data.observations)
 
 
-MOST_ACTIONS = 2
-"""Actions at most that the next step states where there are several warnings."""
+MOST_ACTIONS = 2  # actions at most that the next step states where there are several warnings
 
 
 class Verdict(Enum):

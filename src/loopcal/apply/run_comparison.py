@@ -19,11 +19,9 @@ from loopcal.apply.validation import (
 from loopcal.diagnose.row_errors import PoseErrors, Statistics, join_errors
 from loopcal.diagnose.value_comparison import EQUAL, refuse_other_dimensions
 from loopcal.errors import DataError, FileError
-from loopcal.estimate.posterior import Posterior
 from loopcal.estimate.recalibration import (
     CHANGE_LEVEL,
     ChangeCause,
-    ParameterChanges,
     compare_information,
     judge_change,
 )
@@ -459,27 +457,8 @@ def _compare_pair(
         return pair
     earlier = first.load_posterior()
     changes = compare_information(earlier, second.load_posterior())
-    return _test(pair, earlier, changes, words, tests) if changes.degrees else pair
-
-
-def _find_obstacle(run: Run) -> str:
-    """Return why a run cannot be tested, as in `runs.not-tested`; empty where it can."""
-    if run.fitted_rows is None or "information_rows" not in run.arrays:
-        return "older"
-    if run.result["fit"]["status"] != "converged":
-        return "diverged"
-    information = run.load_posterior().information
-    return "" if information is not None and information.variance > 0.0 else "intervals"
-
-
-def _test(
-    pair: PairComparison,
-    earlier: Posterior,
-    changes: ParameterChanges,
-    words: Mapping[str, str],
-    tests: int,
-) -> PairComparison:
-    """Return a pair with the test of a change, and what explains it."""
+    if not changes.degrees:
+        return pair
     judged = judge_change(changes, earlier.robot, tests)
     shifts, sd = changes.estimate_shifts()
     single = compute_single_level(CHANGE_LEVEL, tests * int(np.isfinite(shifts).sum()))
@@ -498,3 +477,13 @@ def _test(
         cause_shift=judged.shift,
         cause_sd=judged.sd,
     )
+
+
+def _find_obstacle(run: Run) -> str:
+    """Return why a run cannot be tested, as in `runs.not-tested`; empty where it can."""
+    if run.fitted_rows is None or "information_rows" not in run.arrays:
+        return "older"
+    if run.result["fit"]["status"] != "converged":
+        return "diverged"
+    information = run.load_posterior().information
+    return "" if information is not None and information.variance > 0.0 else "intervals"

@@ -48,8 +48,7 @@ from loopcal.results.description import Field, label_axes
 from loopcal.results.result import TableResult
 from loopcal.typing import BoolArray, FloatArray, IntArray, Progress, report_no_progress
 
-HUGE = 1e150
-"""Residuals, in units of sigma, whose squares cannot be summed."""
+HUGE = 1e150  # residuals, in units of sigma, whose squares cannot be summed
 
 
 def prepare_fitted_data(fit: Identification, data: Measurements) -> Measurements:
@@ -161,16 +160,6 @@ def check_start(
     )
 
 
-def choose_noise(options: FitOptions, data: Measurements, left: int) -> FitOptions:
-    """Return options that estimate the noise where all of it is assumed; `left` is the number of
-    equations less that of all unknowns.
-    """
-    is_free = options.noise == "given" and options.prior is None
-    if is_free and data.noise_source == ASSUMED and left >= FEWEST_DEGREES:
-        return replace(options, noise="estimated")
-    return options
-
-
 def identify(
     robot: Mechanism,
     data: Measurements,
@@ -212,7 +201,9 @@ def identify(
     check_rows(problem, data, robot)
     refuse_reused_rows(options.prior, data)
     unknowns = len(free) + (0 if problem.nuisance is None else problem.nuisance.unpenalized_count)
-    options = choose_noise(options, data, int(problem.equations[0]) - unknowns)
+    is_free = options.noise == "given" and options.prior is None and data.noise_source == ASSUMED
+    if is_free and int(problem.equations[0]) - unknowns >= FEWEST_DEGREES:
+        options = replace(options, noise="estimated")
     method = adapt_method(
         options.method or default, free.names, free.assumed, options.noise, free.correlation
     )
@@ -305,10 +296,10 @@ class IdentifiedTrials(TableResult):
         return scaled * self.free_parameters.tolerance
 
 
+# A trial that began with a chord has converged where all further steps together would change the
+# whitened residuals by less than this: no estimate then moves by more than this share of its
+# standard deviation.
 ACCEPTED_STEP = 1e-3
-"""A trial that began with a chord has converged where all further steps together would change the
-whitened residuals by less than this: no estimate then moves by more than this share of its standard
-deviation."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -36,8 +36,8 @@ Noise = Literal["given", "estimated"]
 Begin = Literal["kinematics", "closure"]
 """What is linearized first: the predicted poses, or the loop closure at the measured poses."""
 
+# Attributes that make an object a method, see `loopcal.estimate.penalties.Method`.
 METHOD_PARTS = ("required_equations", "unpenalized", "root", "penalty")
-"""Attributes that make an object a method, see `loopcal.estimate.penalties.Method`."""
 
 
 def _instances(attributes: Sequence[str], examples: str) -> Limit:
@@ -193,11 +193,9 @@ def find_foreign_setting(plain: Mapping[str, Any]) -> tuple[str, str] | None:
     return None
 
 
-NO_LOSS = "none"
-"""Name of the loss None."""
+NO_LOSS = "none"  # name of the loss None
 
-OBJECT = "object"
-"""Key of the text of an object that has no name."""
+OBJECT = "object"  # key of the text of an object that has no name
 
 
 def _refuse_unknown(given: Iterable[str], of_class: type[Any], what: str) -> None:

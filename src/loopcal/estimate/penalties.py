@@ -47,8 +47,8 @@ Rule = Callable[[Decomposition], FloatArray | IntArray]
 
 # Rules that choose the ridge parameter or the truncation from the decomposition itself.
 
+# Grid points per factor of ten; around their minimum the criteria are flat over much more.
 PER_DECADE = 16
-"""Grid points per factor of ten; around their minimum the criteria are flat over much more."""
 
 LOWEST, HIGHEST = 1e-12, 1e4
 """Range of lam in units of the largest squared singular value: no effect to hardly any data."""
@@ -149,15 +149,15 @@ def _gcv(decomposition: Decomposition, penalty: FloatArray) -> FloatArray:
 
 # The methods.
 
+# Standard deviation, in assumed tolerances, of the prior that holds parameters without a stated
+# tolerance: half a percent of the robot's size, and 5 mrad. With 10, the curvature of the residuals
+# along weak combinations costs hundreds of steps; with 3, errors of five assumed tolerances would
+# be further than their standard deviation.
 HOLD = 5.0
-"""Standard deviation, in assumed tolerances, of the prior that holds parameters without a stated
-tolerance: half a percent of the robot's size, and 5 mrad. With 10, the curvature of the residuals
-along weak combinations costs hundreds of steps; with 3, errors of five assumed tolerances would be
-further than their standard deviation."""
 
+# Standard deviation of a combination, in assumed tolerances, beyond which no descent is tried
+# without that prior: a tenth of the robot's size, and 0.1 rad. Up to 27, most fits converge.
 WEAKEST = 100.0
-"""Standard deviation of a combination, in assumed tolerances, beyond which no descent is tried
-without that prior: a tenth of the robot's size, and 0.1 rad. Up to 27, most fits converge."""
 
 
 class Method(Protocol):

@@ -576,11 +576,22 @@ def assess_prior_conflict(
     `components` are what the method inflated.
     """
     statistic, degrees = (float(value[0]) for value in compute_prior_statistic(decomposition))
-    p_value = float(compute_chi_square_tail(degrees, statistic))
-    direction = _test_directions(free, decomposition)
-    parameter = _test_parameters(free, decomposition)
+    p_value, names = float(compute_chi_square_tail(degrees, statistic)), free.names
+    square = np.where(are_penalized(decomposition), decomposition.singular_values**2, 0.0)[0]
+    share, projections = square / (1.0 + square), decomposition.projections[0]
+    # the worst direction is named by its largest parts, in tolerances
+    basis, is_testable = decomposition.directions[0], share > TESTABLE
+    values = np.where(is_testable, np.abs(projections) / np.sqrt(1.0 + square), 0.0)
+    part = np.where(free.assumed, 0.0, np.abs(basis[:, int(np.argmax(values))]))
+    main = [i for i in np.argsort(-part) if part[i] > MAIN_PART * part.max()]
+    direction = _test_largest(values, is_testable, tuple(names[i] for i in main))
+    variance = basis**2 @ share
+    is_testable = (variance > TESTABLE) & ~free.assumed
+    sizes = np.abs(basis @ (np.sqrt(square) * projections / (1.0 + square)))
+    values = np.where(is_testable, sizes / np.sqrt(np.where(is_testable, variance, 1.0)), 0.0)
+    parameter = _test_largest(values, is_testable, (names[int(np.argmax(values))],))
     distance = np.where(free.assumed, 0.0, np.abs(deviation))
-    order, names = np.argsort(-distance), free.names
+    order = np.argsort(-distance)
     far = order[distance[order] > FAR][:NAMED_FARTHEST]
     return PriorConflict(
         statistic=statistic,
@@ -612,31 +623,9 @@ def compute_prior_statistic(decomposition: Decomposition) -> tuple[FloatArray, F
     return np.where(testable, value * first / safe, 0.0), np.where(testable, first**2 / safe, 0.0)
 
 
-def _test_directions(free: FreeParameters, d: Decomposition) -> LargestDeviation:
-    """Test the worst direction (t = 1); it is named by its largest parts, in tolerances."""
-    square = np.where(are_penalized(d), d.singular_values**2, 0.0)[0]
-    testable = square / (1.0 + square) > TESTABLE
-    values = np.where(testable, np.abs(d.projections[0]) / np.sqrt(1.0 + square), 0.0)
-    worst = int(np.argmax(values))
-    part = np.where(free.assumed, 0.0, np.abs(d.directions[0][:, worst]))
-    order = np.argsort(-part)
-    order = order[part[order] > MAIN_PART * part.max()]
-    return _largest(values, testable, tuple(free.names[i] for i in order))
-
-
-def _test_parameters(free: FreeParameters, d: Decomposition) -> LargestDeviation:
-    """Test the worst parameter (t = 1)."""
-    square = np.where(are_penalized(d), d.singular_values**2, 0.0)[0]
-    basis = d.directions[0]
-    deviation = basis @ (np.sqrt(square) * d.projections[0] / (1.0 + square))
-    variance = basis**2 @ (square / (1.0 + square))
-    testable = (variance > TESTABLE) & ~free.assumed
-    spread = np.sqrt(np.where(testable, variance, 1.0))
-    values = np.where(testable, np.abs(deviation) / spread, 0.0)
-    return _largest(values, testable, (free.names[int(np.argmax(values))],))
-
-
-def _largest(values: FloatArray, testable: BoolArray, names: tuple[str, ...]) -> LargestDeviation:
+def _test_largest(
+    values: FloatArray, testable: BoolArray, names: tuple[str, ...]
+) -> LargestDeviation:
     """Return the test of the largest of standard normal values that are testable."""
     count = int(testable.sum())
     if count == 0:

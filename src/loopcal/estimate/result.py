@@ -169,14 +169,6 @@ STATUS_CODES = {
 }
 
 
-def report_status(status: DescentStatus, iterations: int) -> Finding:
-    """Return how the iteration ended."""
-    code = STATUS_CODES[status]
-    if status is DescentStatus.BAD_START:
-        return report_finding("fit.bad-start")
-    return report_finding(code, iterations=iterations)
-
-
 def report_divergence(
     free: FreeParameters, deviation: FloatArray, method: Method, converged: bool
 ) -> list[Finding]:
@@ -289,7 +281,9 @@ class History:
     @property
     def finding(self) -> Finding:
         """How the iteration ended."""
-        return report_status(self.status, self.iterations)
+        has_steps = self.status is not DescentStatus.BAD_START
+        data: dict[str, Any] = {"iterations": self.iterations} if has_steps else {}
+        return report_finding(STATUS_CODES[self.status], **data)
 
     def __repr__(self) -> str:
         """Return the status and the number of iterations."""
@@ -617,11 +611,16 @@ def add_covariance(
     if len(own) and posterior.frames is not None:
         frames = posterior.frames.add_errors(fit.nuisance.names, fit.nuisance.estimate, own)
         posterior = replace(posterior, frames=frames)
+    nuisance = fit.nuisance
+    if len(nuisance):  # infinite standard deviations stay infinite, and NaN stays NaN
+        change = nuisance.slope @ (root / fit.tolerance[:, None]) + (own if len(own) else 0.0)
+        added = np.where(nuisance.table.free, (change**2).sum(axis=1), 0.0)
+        nuisance = replace(nuisance, sd=np.sqrt(nuisance.sd**2 + added))
     return replace(
         fit,
         covariance=fit.covariance + root @ root.T,
         posterior=posterior,
-        nuisance=_add_to_nuisance(fit.nuisance, root / fit.tolerance[:, None], own),
+        nuisance=nuisance,
         findings=(*fit.findings, finding),
     )
 
@@ -658,22 +657,6 @@ def _diagonalize(spread: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray
     used = are_nonzero(s)
     inverse = np.divide(1.0, s, out=np.zeros_like(s), where=used)
     return u, s**2, vt.T * inverse
-
-
-def _add_to_nuisance(
-    nuisance: NuisanceEstimate, root: FloatArray, own: FloatArray
-) -> NuisanceEstimate:
-    """Return setup parameters that follow an added error of the machine, root (p, k) [tolerances],
-    and have one of their `own` (U, k) [SI], or (0, k).
-
-    Infinite standard deviations stay infinite, and NaN stays NaN.
-    """
-    if not len(nuisance):
-        return nuisance
-    moved: BoolArray = nuisance.table.free
-    change = nuisance.slope @ root + (own if len(own) else 0.0)
-    added = np.where(moved, (change**2).sum(axis=1), 0.0)
-    return replace(nuisance, sd=np.sqrt(nuisance.sd**2 + added))
 
 
 # Share of all that the machine does to a nuisance parameter below which a direction does not move
@@ -858,6 +841,11 @@ def estimate_nuisance(
     moved_by_unknown = np.linalg.norm(moved[:, unknown], axis=1)
     is_infinite = moved_by_unknown > SMALLEST_EFFECT * np.linalg.norm(moved, axis=1)
     by_machine = (moved**2) @ np.where(unknown, 0.0, variance)
+    # common displacements of targets and frames along directions that the platform never turns: all
+    # three where it only translates, and the axis where it has one rotation
+    count = int(is_free.sum() - done.rank[0])
+    rotations = sum(freedom in ROTATION_AXES for freedom in robot.freedoms)
+    lost = [p for p, is_lost in zip(table.entries, is_unobservable, strict=True) if is_lost]
     square = np.zeros(U)
     square[is_free] = np.where(
         is_infinite | is_unobservable[is_free],
@@ -873,7 +861,9 @@ def estimate_nuisance(
         np.hstack([done.joint_root() * np.sqrt(noise), UNDETERMINED * done.null_directions()]),
         is_unobservable,
         shown,
-        _only_displaces(robot, table, is_unobservable, int(is_free.sum() - done.rank[0])),
+        count <= {0: 3, 1: 1}.get(rotations, 0)
+        and all(p.dimension is Dimension.LENGTH for p in lost)
+        and len(_owners(p.name for p in lost)) > 1,
     )
 
 
@@ -893,22 +883,6 @@ def add_followers(
         names = _owners(n for n, m in zip(nuisance.names, moved, strict=True) if m)
         described.append(replace(combination, nuisance=tuple(names)))
     return tuple(described)
-
-
-def _only_displaces(
-    robot: Mechanism, table: ParameterTable, is_unobservable: BoolArray, count: int
-) -> bool:
-    """Return whether `count` unobservable directions are common displacements of targets and
-    frames along directions that the platform never turns: all three where it only translates, and
-    the axis where it has one rotation.
-    """
-    lost = [p for p, is_lost in zip(table.entries, is_unobservable, strict=True) if is_lost]
-    rotations = sum(freedom in ROTATION_AXES for freedom in robot.freedoms)
-    return (
-        count <= {0: 3, 1: 1}.get(rotations, 0)
-        and all(p.dimension is Dimension.LENGTH for p in lost)
-        and len(_owners(p.name for p in lost)) > 1
-    )
 
 
 def _owners(names: Iterable[str]) -> list[str]:

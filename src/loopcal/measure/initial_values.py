@@ -29,16 +29,12 @@ from loopcal.numerics.statistics import choose_evenly, find_distinct
 from loopcal.parameters import ParameterTable
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
+# Sum of squares, in variances of the noise, by which one solution fits better than another without
+# being told from it: one standard deviation.
 ALIKE = 1.0
-"""Sum of squares, in variances of the noise, by which one solution fits better than another without
-being told from it: one standard deviation.
-"""
-
-
+# Rows of a group, and values for each of its unknowns, from which start values are sought: more
+# would make them no better, since the geometry of the robot is not known yet.
 FEWEST_ROWS, VALUES = 60, 20.0
-"""Rows of a group, and values for each of its unknowns, from which start values are sought: more
-would make them no better, since the geometry of the robot is not known yet.
-"""
 
 
 class EvaluatedRows(NamedTuple):
@@ -254,7 +250,14 @@ def _list_groups(
         parts = np.split(counts[order], ends) if len(sets) else []
         unknowns = len(rows.kind.nuisance_parameters)
         for own, indices in zip(parts, sets, strict=True):
-            listed.append((i, _choose_rows(rows.present[own], unknowns, own), indices))
+            # start values need an even choice of enough rows, unless it lacks most values of a
+            # component
+            present = rows.present[own]
+            most = max(FEWEST_ROWS, int(VALUES * unknowns / present.shape[1]))
+            chosen = choose_evenly(len(own), most)
+            left, whole = present[chosen].sum(axis=0), present.sum(axis=0)
+            is_enough = (left >= np.minimum(whole, most // 2)).all()
+            listed.append((i, own[chosen] if is_enough else own, indices))
     listed.sort(key=lambda g: (kinds[g[0]][0], kinds.index(kinds[g[0]]), -len(g[1])))
     # a group comes in a later turn than those before it with which it shares an unknown parameter
     turn, turns = np.zeros(len(known), dtype=np.int64), defaultdict(list)
@@ -280,16 +283,6 @@ def _list_groups(
         if not is_alone:
             for *_, indices in together:
                 known[indices] = True
-
-
-def _choose_rows(present: BoolArray, unknowns: int, rows: IntArray) -> IntArray:
-    """Return the rows (r,) of a group, of which components (r, m) are present, that give its start
-    values: an even choice of enough of them, unless it lacks most values of a component.
-    """
-    most = max(FEWEST_ROWS, int(VALUES * unknowns / present.shape[1]))
-    chosen = choose_evenly(len(rows), most)
-    left, whole = present[chosen].sum(axis=0), present.sum(axis=0)
-    return rows[chosen] if (left >= np.minimum(whole, most // 2)).all() else rows
 
 
 def _find_clusters(nuisance: NuisanceParameters) -> IntArray:
