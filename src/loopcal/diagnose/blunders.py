@@ -211,7 +211,9 @@ class Predictor(NamedTuple):
             parts.append((blocks, moved, own @ to_own, shared, r, present))
         if tree is None:
             tree = _build_tree([moved for _, moved, *_ in parts], self._count_own())
-        groups = [group for part in parts for group in _divide(tree, *part)]
+        groups = list[BlockRows]()
+        while parts:  # so that they are not in memory twice
+            groups += _divide(tree, *parts.pop(0))
         return HeldOutBlocks(poses, member, tuple(groups), tree, by_shared.shape[1])
 
     def _iterate_blocks(
