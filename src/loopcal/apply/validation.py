@@ -360,8 +360,7 @@ def validate(
         for values in (nuisance_values_before, nuisance_values)
     )
     compared = compare_predictions(old or robot.nominal, robot, data, kept_before, kept)
-    is_open = _find_unpredicted(compared, uncertainty)
-    unpredicted = _report_unpredicted(compared, is_open)
+    is_open, unpredicted = _find_unpredicted(compared, uncertainty)
     if unpredicted:
         pairs = zip(compared.data.observations, is_open, strict=True)
         data = replace(compared.data, observations=tuple(o.take(~of_kind) for o, of_kind in pairs))
@@ -557,39 +556,32 @@ def _report_left_out(data: Measurements, compared: PredictionComparison) -> list
 
 def _find_unpredicted(
     compared: PredictionComparison, uncertainty: FitUncertainty | None
-) -> list[BoolArray]:
+) -> tuple[list[BoolArray], list[Finding]]:
     """Return the rows (r,) of every kind whose setup the fit does not know: at a known machine it
-    moves their prediction by more than `SETUP_KNOWN` standard deviations of the noise.
+    moves their prediction by more than `SETUP_KNOWN` standard deviations of the noise; and the
+    finding of their poses and setup.
     """
-    after, places = compared.after, {}
+    after, setup, places = compared.after, compared.after.setup, {}
     if uncertainty is not None:
         places = {name: i for i, name in enumerate(uncertainty.names) if name in after.kept}
-    root = np.zeros((len(after.setup), 0 if uncertainty is None else uncertainty.root.shape[1]))
-    for i, name in enumerate(after.setup.table.names):
+    root = np.zeros((len(setup), 0 if uncertainty is None else uncertainty.root.shape[1]))
+    for i, name in enumerate(setup.table.names):
         if uncertainty is not None and name in places:
             root[i] = uncertainty.root[places[name]] / uncertainty.noise_scale
     sizes = after.setup_deviations(compared.data.observations, root)
-    return [of_kind > SETUP_KNOWN for of_kind in sizes]
-
-
-def _report_unpredicted(
-    compared: PredictionComparison, is_open: Sequence[BoolArray]
-) -> list[Finding]:
-    """Report the poses and the setup of rows that are not predicted."""
-    poses: dict[str, None] = {}
-    is_used = np.zeros((2, len(compared.after.setup)), dtype=bool)  # by others, and by these rows
-    setup = compared.after.setup
+    is_open, poses = [of_kind > SETUP_KNOWN for of_kind in sizes], dict[str, None]()
+    is_used = np.zeros((2, len(setup)), dtype=bool)  # by others, and by these rows
     for o, used, opened in zip(compared.data.observations, setup.indices, is_open, strict=False):
         poses |= dict.fromkeys(compared.data.labels[i] for i in o.rows[opened].ravel())
         for own, which in zip(is_used, (~opened, opened), strict=True):
             own[used[which].ravel()] = True
     if not poses:
-        return []
+        return is_open, []
     alone = is_used[1] & ~is_used[0]
     chosen = np.flatnonzero(alone if alone.any() else is_used[1])
     owners = dict.fromkeys(owner_of(setup.table.names[i]) for i in chosen)
     code = "validation.setup-undetermined"
-    return [report_finding(code, poses=tuple(poses), names=tuple(owners))]
+    return is_open, [report_finding(code, poses=tuple(poses), names=tuple(owners))]
 
 
 # Held-out poses that neither the calibration nor the others explain.
@@ -614,14 +606,9 @@ def _report_blunders(
                 None if np.isnan(x) else Quantity(x / unit.factor_to_si, unit.symbol)
                 for x in (every, without)
             )
+            stated: dict[str, Any] = {"poses": poses, "quantity": quantity, "error": error}
             code = "validation.blunders-dominate"
-            stated: dict[str, Any] = {
-                "poses": poses,
-                "quantity": quantity,
-                "error": error,
-                "without": left,
-            }
-            return [*findings, report_finding(code, **stated)]
+            return [*findings, report_finding(code, **stated, without=left)]
     return findings
 
 

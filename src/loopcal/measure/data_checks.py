@@ -324,18 +324,6 @@ def _is_rigid_motion(
     return bool(is_constant.all() and max(turn, shift) <= LARGEST_TILT)
 
 
-def _choose_alike(rows: Observations) -> BoolArray:
-    """Return which rows (r,) measure the same as most others do, such as one corner of a board."""
-    if not rows.kind.label_count:
-        return np.ones(len(rows), dtype=bool)
-    _, of, count = np.unique(
-        rows.labels[rows.is_measured], axis=0, return_inverse=True, return_counts=True
-    )
-    alike = np.zeros(len(rows), dtype=bool)
-    alike[rows.is_measured] = of.ravel() == np.argmax(count) if len(count) else False
-    return alike
-
-
 def _find_static_targets(measurements: Measurements) -> Iterator[_StaticTarget]:
     for rows in measurements.observations:
         kind = rows.kind
@@ -349,8 +337,13 @@ def _find_static_targets(measurements: Measurements) -> Iterator[_StaticTarget]:
         elif len(kind.columns) > 1:  # each column by itself, too
             for j, column in enumerate(kind.columns):
                 targets.setdefault(column.name, [j])
+        alike, is_measured = np.ones(len(rows), dtype=bool), rows.is_measured
+        if kind.label_count:  # rows that measure what most do, such as one corner of a board
+            own = rows.labels[is_measured]
+            _, of, count = np.unique(own, axis=0, return_inverse=True, return_counts=True)
+            alike = is_measured.copy()
+            alike[is_measured] = of.ravel() == np.argmax(count) if len(count) else False
         for session in find_distinct(rows.session):
-            alike = _choose_alike(rows)
             for target, columns in targets.items():
                 is_complete = alike & ~np.any(np.isnan(rows.measured[:, columns]), axis=1)
                 present = (rows.session == session) & is_complete

@@ -46,25 +46,6 @@ class ComparedRows(NamedTuple):
         return self.content[:, self.readings :]
 
 
-def _find_agreeing(rows: ComparedRows, fitted: FloatArray, is_same_form: bool) -> BoolArray:
-    """Return which rows (r,) are copies of one of the fitted rows (k, c) [SI].
-
-    is_same_form : whether the columns of both mean the same; otherwise values are looked for in all
-        columns, as where a pose became a position.
-    """
-    agree = _is_among(rows, fitted) if is_same_form else _has_values_of(rows, fitted)
-    if not agree.any() or not rows.values.shape[1]:
-        return agree
-    chance = _estimate_chance(rows, fitted, is_same_form)
-    largest = float(chance[agree].max())
-    if largest <= CHANCE:
-        return agree
-    # whether more rows agree than repeats by chance would, each with this probability
-    count = int(agree.sum())
-    repeats = sum(len(near) > 0 for near in _find_repeats(rows, fitted))
-    return agree & bool(binomial_tail(count - 1, max(repeats, count), largest) < CHANCE)
-
-
 def _estimate_chance(rows: ComparedRows, fitted: FloatArray, is_same_form: bool) -> FloatArray:
     """Return the probability (r,) that a repeat agrees with its first row by rounding."""
     other = fitted[:, rows.readings :]
@@ -231,8 +212,17 @@ class FittedRows:
         """Return which rows (r,) are copies of one of these."""
         copies = np.zeros(len(rows.content), dtype=bool)
         for kind, content in self.groups:
+            # else the columns of both do not mean the same, as where a pose became a position
             is_same_form = kind == rows.kind and content.shape[1] == rows.content.shape[1]
-            copies |= _find_agreeing(rows, content, is_same_form)
+            agree = (_is_among if is_same_form else _has_values_of)(rows, content)
+            if agree.any() and rows.values.shape[1]:
+                largest = float(_estimate_chance(rows, content, is_same_form)[agree].max())
+                if largest > CHANCE:
+                    # whether more agree than repeats by chance would, each with this probability
+                    count = int(agree.sum())
+                    repeats = sum(len(near) > 0 for near in _find_repeats(rows, content))
+                    agree &= binomial_tail(count - 1, max(repeats, count), largest) < CHANCE
+            copies |= agree
         return copies
 
     def find_in(self, data: Measurements) -> ReusedRows:

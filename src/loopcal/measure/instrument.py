@@ -20,7 +20,7 @@ from loopcal.measure.array_checks import (
 )
 from loopcal.measure.kinds.kind import Kind, measure_progress
 from loopcal.measure.nuisance import StatedValue
-from loopcal.measure.observations import TextArray, check_labels, check_rows
+from loopcal.measure.observations import TextArray, check_labels, check_poses, check_rows
 from loopcal.mechanism.model import Mechanism
 from loopcal.typing import FloatArray, IntArray
 from loopcal.units import SD_RANGE, Dimension, is_sd
@@ -173,11 +173,7 @@ class Sensor:
         pose does not exist.
         """
         rows = self._list_rows(n_poses)
-        if rows.size and (rows.min() < 0 or rows.max() >= n_poses):
-            raise DataError(
-                f"the rows of kind {self.kind.name!r} refer to pose {int(rows.max())}, but the "
-                f"{n_poses} poses are 0 to {n_poses - 1}. Correct the rows"
-            )
+        check_poses(rows, self.kind, n_poses)
         names = {
             name: check_labels(getattr(self, name), len(rows), name)
             for name in ("session", "group")

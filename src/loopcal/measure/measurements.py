@@ -22,7 +22,7 @@ from loopcal.measure.array_checks import (
 )
 from loopcal.measure.kinds.kind import Kind
 from loopcal.measure.nuisance import NuisanceParameters, StatedValue, collect_nuisance_parameters
-from loopcal.measure.observations import Observations
+from loopcal.measure.observations import Observations, check_poses
 from loopcal.measure.readings import (
     check_reading_sigma,
     find_reading_tolerance,
@@ -41,17 +41,11 @@ def _check_bodies(of_poses: Sequence[Observations], of_base: Sequence[Observatio
     """Refuse rows of the base among those of poses, the reverse, and a target on two bodies."""
     kinds = [rows.kind for rows in (*of_poses, *of_base)]
     for i, kind in enumerate(kinds):
-        if kind.is_of_base and i < len(of_poses):
-            raise DataError(
-                f"rows of kind {kind.name!r} measure targets on the base. Pass them as "
-                "`base_observations`, not as `observations`"
-            )
-        if i >= len(of_poses) and not kind.is_of_base:
-            raise DataError(
-                f"rows of kind {kind.name!r} measure poses. Pass them as `observations`, or give "
-                'their kind `of="base"`'
-            )
-    for kind in kinds:
+        if kind.is_of_base != (i >= len(of_poses)):
+            fault = 'poses. Pass them as `observations`, or give their kind `of="base"`'
+            if kind.is_of_base:
+                fault = "targets on the base. Pass them as `base_observations`, not `observations`"
+            raise DataError(f"rows of kind {kind.name!r} measure {fault}")
         if kind.is_of_base and (shared := list_moving_targets(kind, kinds)):
             raise DataError(report_finding("data.target-on-two-bodies", targets=shared))
 
@@ -159,7 +153,7 @@ class Measurements(TableResult):
             check_type(
                 rows, Observations, "observations", "such as loopcal.Observations.from_sigma(...)"
             )
-            _check_poses(rows, n)
+            check_poses(rows.rows, rows.kind, n)
         set_fields(
             self,
             readings=readings,
@@ -371,17 +365,6 @@ def _check_held_out(is_held_out: ArrayLike, block: IntArray, labels: tuple[str, 
         )
     mask.setflags(write=False)
     return mask
-
-
-def _check_poses(rows: Observations, n: int) -> None:
-    poses = rows.rows.reshape(len(rows), rows.kind.poses_per_row)
-    refuse_first(
-        (poses < 0) | (poses >= n),
-        lambda i, j: (
-            f"row {i + 1} of kind {rows.kind.name!r} refers to pose {int(poses[i, j])}, but the "
-            f"{n} poses are 0 to {n - 1}. Correct the row, or add the readings of the pose"
-        ),
-    )
 
 
 ENOUGH = 0.5  # share of the poses to hold out that the setup must leave

@@ -477,6 +477,18 @@ def check_rows(rows: ArrayLike, kind: Kind) -> IntArray:
     return given.astype(np.intp)
 
 
+def check_poses(rows: IntArray, kind: Kind, n: int) -> None:
+    """Refuse rows (r,) or (r, l) of poses that do not exist."""
+    poses = rows.reshape(len(rows), kind.poses_per_row)
+    refuse_first(
+        (poses < 0) | (poses >= n),
+        lambda i, j: (
+            f"row {i + 1} of kind {kind.name!r} refers to pose {int(poses[i, j])}, but the {n} "
+            f"poses are 0 to {n - 1}. Correct the row, or add the readings of the pose"
+        ),
+    )
+
+
 def check_labels(value: ArrayLike, r: int, what: str) -> TextArray:
     """Return read-only labels (r,) from one text or one for each row."""
     given = np.asarray(value)
