@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import loopcal as lc
-from loopcal.apply.correction_tables import CorrectionTable, TableSize, make_tables
+from loopcal.apply.compensation import CorrectionTable, TableSize, make_tables
 from loopcal.errors import DataError
 from loopcal.io.robot.robot_file import list_shipped_robots
 from loopcal.units import Dimension

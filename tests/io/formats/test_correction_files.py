@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import loopcal as lc
-from loopcal.apply.correction_tables import TableSize, make_tables
+from loopcal.apply.compensation import TableSize, make_tables
 from loopcal.cli.entry_point import main
 from loopcal.documents import list_controllers
 from loopcal.geometry import align_point_sets

@@ -681,7 +681,7 @@ def export(
       loopcal export run --format grid --table-error 5um -o grid.csv
     """
     from loopcal.apply.base_motion import choose_base
-    from loopcal.apply.correction_tables import TableSize, make_tables
+    from loopcal.apply.compensation import TableSize, make_tables
     from loopcal.io.core.outputs import refuse_outputs
     from loopcal.io.core.text_file import write_text
     from loopcal.io.formats.import_export import build_source, choose_format, export_robot

@@ -14,7 +14,6 @@ Klipper's "Bed mesh" and its module bed_mesh; RepRapFirmware's Grid; LinuxCNC's 
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -34,17 +33,16 @@ from loopcal.typing import FloatArray
 from loopcal.units import UNITS, Dimension
 
 if TYPE_CHECKING:
-    from loopcal.apply.correction_tables import What
+    from loopcal.apply.compensation import What
 
-Writer = Callable[[ExportSource, Path | None], Exported]
+Writer = Callable[[ExportSource], Exported]
 PROFILE = "loopcal"
 DIGITS = 9
 """Significant digits of a CSV file: of a meter, a nanometer."""
 
 
-def write_grid(source: ExportSource, into: Path | None) -> Exported:
+def write_grid(source: ExportSource) -> Exported:
     """Return one row for each node: where it is, and what to add there."""
-    del into
     (table,), robot = source.tables, source.robot
     units = {name: robot.get_unit(get_dimension(name)) for name in (*table.axes, *table.values)}
     parts = (("", table.axes), ("add ", table.values))
@@ -62,36 +60,28 @@ def _get_heights(source: ExportSource) -> tuple[FloatArray, FloatArray, FloatArr
     return table.axes["x"] / MM, table.axes["y"] / MM, table.values["z"].T / MM
 
 
-def write_mesh(source: ExportSource, into: Path | None) -> Exported:
+def write_mesh(source: ExportSource) -> Exported:
     """Return a profile of Klipper, a file to include."""
-    del into
     x, y, heights = _get_heights(source)
     lines = [
-        f"# Load it by BED_MESH_PROFILE LOAD={PROFILE}. Set split_delta_z of [bed_mesh] to 0.01."
+        f"# Load it by BED_MESH_PROFILE LOAD={PROFILE}. Set split_delta_z of [bed_mesh] to 0.01.",
+        *(f"[bed_mesh {PROFILE}]", "version: 1", "points:"),
+        *("    " + ", ".join(map(format_number, row)) for row in heights.tolist()),
     ]
-    lines += [f"[bed_mesh {PROFILE}]", "version: 1", "points:"]
-    lines += ["    " + ", ".join(map(format_number, row)) for row in heights.tolist()]
     for name, nodes in (("x", x), ("y", y)):
-        lines += [
-            f"min_{name}: {format_number(nodes[0])}",
-            f"max_{name}: {format_number(nodes[-1])}",
-        ]
+        ends = zip(("min", "max"), (nodes[0], nodes[-1]), strict=True)
+        lines += [f"{end}_{name}: {format_number(number)}" for end, number in ends]
         lines += [f"{name}_count: {len(nodes)}", f"mesh_{name}_pps: 0"]
     return Exported("\n".join([*lines, "algo: direct", "tension: 0.2"]) + "\n")
 
 
-def write_height_map(source: ExportSource, into: Path | None) -> Exported:
+def write_height_map(source: ExportSource) -> Exported:
     """Return a heightmap.csv, in the form of RepRapFirmware 3.3 and later."""
-    del into
     x, y, heights = _get_heights(source)
     decimals = 4 if np.abs(heights).max() < 10.0 else 3
     numbers = [x[0], x[-1], y[0], y[-1], -1.0, x[1] - x[0], y[1] - y[0]]
-    statistics = zip(
-        ("min error", "max error", "mean", "deviation"),
-        (heights.min(), heights.max(), heights.mean(), heights.std()),
-        strict=True,
-    )
-    head = ", ".join(f"{name} {value:.3f}" for name, value in statistics)
+    low, high, mean, sd = heights.min(), heights.max(), heights.mean(), heights.std()
+    head = f"min error {low:.3f}, max error {high:.3f}, mean {mean:.3f}, deviation {sd:.3f}"
     lines = [f"RepRapFirmware height map file v2 by loopcal, {head}"]
     lines += ["axis0,axis1,min0,max0,min1,max1,radius,spacing0,spacing1,num0,num1"]
     grid = ",".join(format_short(number, 6) for number in numbers)
@@ -100,44 +90,40 @@ def write_height_map(source: ExportSource, into: Path | None) -> Exported:
     return Exported("\n".join(lines) + "\n")
 
 
-def write_compensation(source: ExportSource, into: Path | None) -> Exported:
+def write_compensation(source: ExportSource) -> Exported:
     """Return the lines of the INI file, and a compensation file for each joint."""
-    del into
     robot, lines, files = source.robot, list[str](), dict[str, str]()
     dimensions = {actuator.name: actuator.dimension for actuator in robot.actuators}
     for joint, table in enumerate(source.tables):
         (name, nodes), (trims,) = *table.axes.items(), table.values.values()
         is_length = dimensions[name] is Dimension.LENGTH
         unit = robot.get_unit(Dimension.LENGTH) if is_length else UNITS["deg"]
-        rows = np.column_stack([nodes, trims, trims]) / unit.factor_to_si
+        rows = 0.0 + np.column_stack([nodes, trims, trims]) / unit.factor_to_si
         file = f"{source.stem}-joint{joint}.comp"
-        files[file] = "".join(
-            " ".join(map(format_number, (0.0 + row).tolist())) + "\n" for row in rows
-        )
-        lines += [f"# {name}", f"[JOINT_{joint}]", f"COMP_FILE = {file}"]
-        lines += ["COMP_FILE_TYPE = 1"]
+        files[file] = "".join(" ".join(map(format_number, row)) + "\n" for row in rows.tolist())
+        lines += [f"# {name}", f"[JOINT_{joint}]", f"COMP_FILE = {file}", "COMP_FILE_TYPE = 1"]
     notes = note_lost_terms(robot, COMPENSATION.name)
     if source.is_for_people:
         lines += [f"# {file}\n{text.rstrip()}" for file, text in files.items()]
     return Exported("\n".join(lines) + "\n", notes, files)
 
 
-def write_skew(source: ExportSource, into: Path | None) -> Exported:
+def write_skew(source: ExportSource) -> Exported:
     """Return a profile of Klipper's [skew_correction], and factors of rotation_distance."""
-    del into
     values = {name: float(value) for name, value in source.tables[0].values.items()}
     lines = [
-        f"# Add [skew_correction] to printer.cfg, and load this by SKEW_PROFILE LOAD={PROFILE}."
+        f"# Add [skew_correction] to printer.cfg, and load this by SKEW_PROFILE LOAD={PROFILE}.",
+        *(f"# Multiply rotation_distance of [stepper_{n}] by {values[n]:.9f}." for n in "xyz"),
+        f"[skew_correction {PROFILE}]",
+        *(f"{plane}_skew: {values[plane]:.9f}" for plane in ("xy", "xz", "yz")),
     ]
-    lines += [f"# Multiply rotation_distance of [stepper_{n}] by {values[n]:.9f}." for n in "xyz"]
-    lines += [f"[skew_correction {PROFILE}]"]
-    lines += [f"{plane}_skew: {values[plane]:.9f}" for plane in ("xy", "xz", "yz")]
     return Exported("\n".join(lines) + "\n")
 
 
 def _describe(name: str, what: str, write: Writer, table: tuple[What, int, int]) -> Format:
-    """Return the format of a table."""
-    return Format(name, what, (), None, write, takes_file=False, table=table)
+    """Return the format of a table, which is written without another file."""
+    kept = {"takes_file": False, "table": table}
+    return Format(name, what, (), None, lambda source, into: write(source), **kept)
 
 
 GRID = _describe("grid", "corrections over a grid, as CSV", write_grid, ("commands", 20000, 500))

@@ -29,7 +29,7 @@ from loopcal.plain_text import quote
 from loopcal.units import LARGEST
 
 if TYPE_CHECKING:
-    from loopcal.apply.correction_tables import CorrectionTable, What
+    from loopcal.apply.compensation import CorrectionTable, What
     from loopcal.measure.kinds.kind import Kind
     from loopcal.measure.measurements import Measurements
     from loopcal.measure.observations import Observations
@@ -168,7 +168,7 @@ class Format:
     read_options : options of `ImportOptions` that `read` uses -> what is particular to this format,
         such as which lengths are taped, for help texts.
     table : of a format of corrections what it corrects, and the most nodes that it may have, in all
-        and along an axis: see `loopcal.apply.correction_tables.TableSize`.
+        and along an axis: see `loopcal.apply.compensation.TableSize`.
     stores_fit : whether a file contains a geometry together with the measurements that its firmware
         fitted it to, so that `loopcal.diagnose` can compare the two.
     """

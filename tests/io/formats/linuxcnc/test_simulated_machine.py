@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 import loopcal as lc
-from loopcal.apply.correction_tables import TableSize, make_tables
+from loopcal.apply.compensation import TableSize, make_tables
 from loopcal.io.formats import linuxcnc as genhexkins
 from loopcal.io.formats.correction_files import write_compensation
 from loopcal.io.formats.linuxcnc_kinematics import NAME, write
