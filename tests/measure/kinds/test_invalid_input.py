@@ -195,7 +195,7 @@ REFUSED = {
     "the sigma of the noise: row 1 is nan": lambda: Gaussian(np.array([np.nan])),
     "Give one for each of rx, ry, rz, x, y, z": lambda: Sensor(POSE, Gaussian(np.ones(1))),
     "at least one sensor": lambda: Instrument(()),
-    "refer to pose 7, but the 4 poses are 0 to 3": (
+    "refers to pose 7, but the 4 poses are 0 to 3": (
         lambda: Sensor(BAR, Gaussian(np.ones(1)), rows=np.array([[0, 7]])).assign_rows(4)
     ),
     "compares two poses, but the number of poses is 1": (
