@@ -263,7 +263,7 @@ def test_compensation_files_of_the_joints_correct_the_screws(
     controller = truth.with_values(np.where(is_gain, table.nominal, truth.values))
     tables, found = make_tables(truth, controller, TableSize("readings", 256, 256), 1e-6)
     assert found.data["is_met"]
-    files = write_compensation(ExportSource(truth, tables=tables, stem="table"), None).beside
+    files = write_compensation(ExportSource(truth, tables=tables, stem="table")).beside
     component.write_text(write(ExportSource(controller, {}, {}), None).text, "utf-8")
     subprocess.run(["halcompile", "--install", component], check=True, capture_output=True)
     homes = lc.inverse(controller, controller.home[None]).q[0] / MM
