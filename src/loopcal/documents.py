@@ -75,7 +75,7 @@ def load_record(
         arrays=arrays,
         robot=robot,
         initial=run.initial_robot,
-        posterior=posterior_from_arrays(robot, arrays) if "posterior_unit" in arrays else None,
+        posterior=posterior_from_arrays(robot, arrays),
         validation=None if stored is None else restore_validation(stored, arrays, robot),
         heights=restore_heights(arrays, robot),
         residuals=residuals_from_arrays(arrays),

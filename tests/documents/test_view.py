@@ -90,7 +90,7 @@ def test_view_of_a_fit_that_did_not_converge_shows_the_robot_before(run) -> None
     record = load_record(run)
     fit = {**record.result["fit"], "status": "out_of_iterations"}
     result = {**record.result, "verdict": "not_calibrated", "fit": fit, "headline": "Failed."}
-    text = render_html(build_calibration_view(replace(record, result=result, posterior=None)))
+    text = render_html(build_calibration_view(replace(record, result=result)))
     assert say("scene-figure.not-converged") in text
     assert "The robot at home." in text
     assert '<header class="not_calibrated">' in text

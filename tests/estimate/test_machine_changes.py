@@ -21,7 +21,6 @@ from loopcal.estimate.recalibration import (
     Change,
     ErrorPart,
     ParameterChanges,
-    assess_change,
     compare_information,
     explain_change,
     recalibrate,
@@ -390,11 +389,3 @@ def test_copies_in_an_unknown_form_agree_too_well(method) -> None:
             ROBOTS["linear-delta"], measure_delta(truth, seed, 1.0), first.posterior
         )[1]
         assert other.finding.code in ("prior.machine-unchanged", "prior.machine-changed")
-
-
-def test_an_earlier_run_that_stores_no_information_is_named_as_the_reason() -> None:
-    robot = ROBOTS["linear-delta"]
-    earlier = identify(robot, measure(robot, robot, 1)).posterior
-    later = identify(robot, measure(robot, robot, 2))
-    change = assess_change(replace(earlier, information=None), later, later.names, "the machine")
-    assert change.finding.code == "prior.change-not-stored"

@@ -96,17 +96,13 @@ def test_changed_file_is_never_removed(tmp_path, name) -> None:
     assert f"{name} in this folder has changed" in found
 
 
-def test_folder_of_a_version_without_list_may_contain_known_names(tmp_path) -> None:
-    write(tmp_path / "a")
-    (tmp_path / "a" / "result.json").write_text('{"made_by": {}, "fit": {}}')
-    (tmp_path / "a" / "robot.yaml").write_text("of an older version")
-    write(tmp_path / "a", force=True)
-    (tmp_path / "a" / "result.json").write_text('{"made_by": {}, "fit": {}}')
-    (tmp_path / "a" / "robot.yml").touch()
-    assert "also contains robot.yml" in refuse(tmp_path / "a")
-
-
-@pytest.mark.parametrize("text", ["", "{", "[]", "null", '{"fit": 1}', "[" * 100_000])
+@pytest.mark.parametrize(
+    "text",
+    [
+        *("", "{", "[]", "null", '{"fit": 1}', "[" * 100_000),
+        *(f'{{"made_by": {{}}, "fit": {{}}{rest}}}' for rest in ("", ', "files": {}')),
+    ],
+)
 def test_folder_with_another_document_is_not_replaced(tmp_path, text) -> None:
     (tmp_path / "a").mkdir()
     (tmp_path / "a" / "result.json").write_text(text)

@@ -21,15 +21,23 @@ from loopcal.io.runs.run_folder import (
 RESULT = {
     "format": 2,
     "made_by": {"command": [], "inputs": {}},
-    "fit": {"parameters": [{"name": "x", "plus_minus": 0.1}], "status": "converged"},
+    "fit": {
+        "parameters": [{"name": "x", "plus_minus": 0.1, "estimate": 1.0, "unit": "m"}],
+        "status": "converged",
+        "local": [],
+        "dropped": [],
+        **dict.fromkeys(("sigma_scale", "noise_degrees", "p_value", "sigma_uncertainty"), 1.0),
+        "noise": "given",
+    },
     "verdict": "calibrated",
     "passed": True,
     "reasons": [],
     "split": None,
+    "options": {"fit": {}},
 }
 """The least that result.json of a run states."""
 
-SIZES = {"p": 1, "a": 1, "u": 0, "e": 0, "s": 1, "c": 1}
+SIZES = {"p": 1, "a": 1, "u": 0, "e": 0, "s": 1, "c": 1, "d": 1, "2": 2}
 TYPES = {"finite": "f8", "number": "f8", "logical": "?", "text": "U1", "whole": "i8"}
 ARRAYS = {
     name: np.ones([SIZES[size] for size in form.split()[1:]]).astype(TYPES[form.split()[0]])
@@ -76,7 +84,7 @@ def test_what_is_no_complete_run_is_refused(tmp_path) -> None:
     with pytest.raises(FileError, match="not a run folder"):
         read_run_folder(tmp_path)
     folder = write(tmp_path / "run")
-    for text, word in (("{", "damaged"), ('{"format": 99}', "newer")):
+    for text, word in (("{", "damaged"), ('{"format": 99}', "Calibrate again")):
         (folder / "result.json").write_text(text)
         with pytest.raises(FileError, match=word):
             read_run_folder(folder)

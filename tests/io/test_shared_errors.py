@@ -183,12 +183,11 @@ def test_a_bias_and_an_unknown_frame_together_begin_from_the_frame(tmp_path):
     "lines",
     [
         ["unknown: [offset]", "unknowns: {wire.offset: {sd: 0.2 mm}}"],
-        ["unknown: [offset]", "unknowns: {distance.offset: {sd: 0.2 mm}}"],
-        ["unknown: [bias]", "unknowns: {wire.bias.distance: {sd: 0.2 mm}}"],
+        ["unknown: [bias]", "unknowns: {wire.offset: {sd: 0.2 mm}}"],
         ["session_bias: {distance: 0.2 mm}"],
     ],
 )
-def test_offset_and_bias_of_a_distance_are_one_unknown_under_old_names_too(tmp_path, lines):
+def test_offset_and_bias_of_a_distance_are_one_unknown(tmp_path, lines):
     settings = ["kind: distance", "anchor: [0 mm, 0 mm, 900 mm]", "anchor_name: wire"]
     settings += ["noise: {distance: 10 um}", *lines]
     head = "\n".join(f"# {line}" for line in settings)

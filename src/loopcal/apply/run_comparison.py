@@ -253,11 +253,10 @@ def _summarize(name: str, run: Run) -> RunSummary:
     estimates, plus_minus = {}, {}
     for row in fit["parameters"]:
         place = run.robot.parameters.index(row["name"])
-        unit, half = UNITS.get(row.get("unit", "")), row["plus_minus"]
+        unit, half = UNITS[row["unit"]], row["plus_minus"]
         estimates[row["name"]] = float(run.robot.values[place])
-        # runs of earlier versions may state no unit, and then no interval is known
-        plus_minus[row["name"]] = None if half is None or unit is None else half * unit.factor_to_si
-    verdict = str(run.result.get("verdict", "")).replace("_", " ")
+        plus_minus[row["name"]] = None if half is None else half * unit.factor_to_si
+    verdict = str(run.result["verdict"]).replace("_", " ")
     return RunSummary(name, run.robot.name, fit.get("method", ""), verdict, estimates, plus_minus)
 
 
@@ -360,7 +359,7 @@ def _find_common_poses(runs: Sequence[Run]) -> tuple[str, ...]:
     """
     digests = []
     for run in runs:
-        files = run.result.get("made_by", {}).get("inputs", {})
+        files = run.result["made_by"]["inputs"]
         of_data = [r for r in files if r.partition("-")[0] in ("data", "poses")]
         digests.append(sorted(files[role]["sha256"] for role in of_data))
     if not digests[0] or any(digest != digests[0] for digest in digests):
@@ -481,8 +480,8 @@ def _compare_pair(
 
 def _find_obstacle(run: Run) -> str:
     """Return why a run cannot be tested, as in `runs.not-tested`; empty where it can."""
-    if run.fitted_rows is None or "information_rows" not in run.arrays:
-        return "older"
+    if run.fitted_rows is None:
+        return "rows"
     if run.result["fit"]["status"] != "converged":
         return "diverged"
     information = run.load_posterior().information

@@ -666,16 +666,14 @@ def store_differences(validation: Validation) -> dict[str, FloatArray]:
 
 def restore_validation(
     content: Mapping[str, Any], arrays: Mapping[str, np.ndarray], robot: Mechanism
-) -> Validation | None:
-    """Return the numbers of a stored validation; None where an older version wrote it.
+) -> Validation:
+    """Return the numbers of a stored validation.
 
     Findings stay sentences of `content`. Only the errors before and after have differences by
     component; of the others, the first component is the size.
 
     content : `Validation.to_dict()` of the run. arrays : of the run. robot : for units.
     """
-    if content.get("judged") is None:
-        return None
     errors = {
         name: _restore_errors(content[name], arrays, f"{PREFIX}_{name}")
         for name in (*ERRORS, "commanded_before", "commanded_after", "not_compensable")

@@ -241,12 +241,10 @@ def uncertainty_from_arrays(
     arrays: Mapping[str, np.ndarray],
     noise_scale: float,
     noise: NoiseKnowledge,
-) -> FitUncertainty | None:
+) -> FitUncertainty:
     """Return the joint uncertainty of a corrected robot and its nuisance parameters `names` in the
-    arrays of a run folder; None in one that has none. Raises as `posterior_from_arrays`.
+    arrays of a run folder. Raises as `posterior_from_arrays`.
     """
-    if SLOPE not in arrays or ROOT not in arrays:
-        return None
     posterior = posterior_from_arrays(robot, arrays)
     return FitUncertainty(posterior, names, arrays[SLOPE], arrays[ROOT], noise_scale, noise)
 

@@ -317,12 +317,11 @@ class FrameKnowledge:
 
 def frames_from_arrays(arrays: Mapping[str, np.ndarray]) -> FrameKnowledge | None:
     """Return the frames in the arrays of a run folder; None where it does not hold them."""
-    names = ("unfixed", "readings", "names", "T", "by_parameters", "own")
-    if any(f"frames_{name}" not in arrays for name in names):
+    if BY_MOTIONS not in arrays:
         return None
+    names = ("unfixed", "readings", "names", "T", "by_parameters", "own")
     unfixed, readings, labels, *stacked = (arrays[f"frames_{name}"] for name in names)
-    nothing = np.full((len(labels), 6, 12), np.nan)
-    motions = [m if np.isfinite(m).all() else None for m in arrays.get(BY_MOTIONS, nothing)]
+    motions = [m if np.isfinite(m).all() else None for m in arrays[BY_MOTIONS]]
     instruments = map(InstrumentFrame, *stacked, motions)
     frames = dict(zip(map(str, labels.tolist()), instruments, strict=True))
     return FrameKnowledge(unfixed, readings, frames)
@@ -337,8 +336,7 @@ class Posterior:
     variance : (p,) of each direction; infinite for unknown ones, NaN without intervals.
     determined : (p,) True for directions that the rows determine; of the others at most a prior is
         known.
-    frames : which frames the measurements determine; None where it is not known, as in run folders
-        of earlier versions.
+    frames : which frames the measurements determine; None where it is not known.
     parts : the parts of the covariance whose size was estimated from data, with their degrees of
         freedom; what they leave of the covariance counts as known.
     fitted_rows : the measured rows that it comes from, so that they do not count twice; None where
@@ -511,35 +509,27 @@ def find_variance_sources(
 def posterior_from_arrays(robot: Mechanism, arrays: Mapping[str, np.ndarray]) -> Posterior:
     """Return the posterior in the arrays of a run folder with this corrected robot.
 
-    What an older version did not write is None. EstimationError: the run has no posterior, or its
-    robot now has other free parameters.
+    EstimationError: it is a robot file, or its robot now has other free parameters.
     """
-    names = [field.name for field in Posterior.FIELDS]
-    missing = [PREFIX + name for name in names if PREFIX + name not in arrays]
-    if missing:
-        raise EstimationError(report_finding("prior.no-posterior", array=missing[0]))
-    unit, directions, variance, determined = (arrays[PREFIX + name] for name in names)
+    if not arrays:
+        raise EstimationError(report_finding("prior.no-posterior"))
+    unit, directions, variance, determined = (arrays[PREFIX + f.name] for f in Posterior.FIELDS)
     places = np.flatnonzero(robot.parameters.free)
     if len(places) != len(unit):
         raise EstimationError(
             report_finding("prior.other-count", identified=len(unit), free=len(places))
         )
-    parts: tuple[CovariancePart, ...] = ()
-    if all(PREFIX + name in arrays for name in ("source", "degrees", "root", "part")):
-        roots, number = arrays[PREFIX + "root"], arrays[PREFIX + "part"]
-        stated = zip(arrays[PREFIX + "source"].tolist(), arrays[PREFIX + "degrees"], strict=True)
-        parts = tuple(
-            CovariancePart(str(source), roots[:, number == i], float(degrees))
-            for i, (source, degrees) in enumerate(stated)
-        )
+    roots, number = arrays[PREFIX + "root"], arrays[PREFIX + "part"]
+    stated = zip(arrays[PREFIX + "source"].tolist(), arrays[PREFIX + "degrees"], strict=True)
+    parts = tuple(
+        CovariancePart(str(source), roots[:, number == i], float(degrees))
+        for i, (source, degrees) in enumerate(stated)
+    )
     errors = restore_arrays(SmoothErrors, arrays, DISCREPANCY_PREFIX)
     discrepancy = errors and restore_arrays(
         ModelDiscrepancy, arrays, DISCREPANCY_PREFIX, errors=errors
     )
-    information = None
-    if INFORMATION[0] in arrays:
-        rows, deviations, noise = (arrays[name] for name in INFORMATION)
-        information = DataInformation(rows, deviations, *noise.tolist())
+    rows, deviations, noise = (arrays[name] for name in INFORMATION)
     return Posterior(
         robot,
         places,
@@ -552,7 +542,7 @@ def posterior_from_arrays(robot: Mechanism, arrays: Mapping[str, np.ndarray]) ->
         fitted_rows_from_arrays(arrays),
         discrepancy,
         ShownNoise(*arrays[SHOWN_NOISE].tolist()) if SHOWN_NOISE in arrays else None,
-        information,
+        DataInformation(rows, deviations, *noise.tolist()),
         arrays.get(SHOWN_READINGS),
     )
 

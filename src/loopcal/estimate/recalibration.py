@@ -153,8 +153,6 @@ def assess_change(
     code, changes = "prior.change-not-observable", None
     if not later.converged:
         code = "prior.change-not-converged"
-    elif earlier.information is None:
-        code = "prior.change-not-stored"
     else:
         changes = compare_information(earlier, later.posterior)
         changes = changes.select([changes.names.index(name) for name in names])

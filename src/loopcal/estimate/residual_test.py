@@ -218,11 +218,11 @@ class NoiseKnowledge:
 
     @classmethod
     def restore(cls, fit: Mapping[str, Any]) -> NoiseKnowledge:
-        """Return the same from the `fit` of a stored result; sigma as stated where it is of an
-        earlier version, or did not converge.
+        """Return the same from the `fit` of a stored result; sigma as stated where it did not
+        converge.
         """
-        scale, p_value = fit.get("sigma_scale"), fit.get("p_value")
-        if scale is None or "noise_degrees" not in fit:
+        scale, p_value = fit["sigma_scale"], fit["p_value"]
+        if scale is None:
             return SIGMA_AS_STATED
         stated = count_sigma_degrees(fit["noise"], fit["sigma_uncertainty"])
         has_failed = fit["noise"] == "given" and p_value is not None and p_value < SIGNIFICANCE

@@ -110,7 +110,7 @@ def store_residuals(residuals: Sequence[KindResiduals]) -> dict[str, np.ndarray]
 
 
 def residuals_from_arrays(arrays: Mapping[str, np.ndarray]) -> tuple[KindResiduals, ...]:
-    """Return the residuals in the arrays of a run folder; none where an older version wrote it."""
+    """Return the residuals in the arrays of a run folder; none where an array of one is missing."""
     matches = [match for name in arrays if (match := _NAME.fullmatch(name))]
     others, result = (*(field.name for field in KindResiduals.FIELDS), "fitted_"), []
     for match in sorted(matches, key=lambda m: int(m[1])):

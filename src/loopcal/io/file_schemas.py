@@ -90,14 +90,13 @@ class SchemaMaker:
         for key in stated:
             text = "; ".join(filter(None, (key.meaning, key.holds)))
             keys[key.name] = {**self.describe(hints[key.name]), "description": text}
-        older: Mapping[str, tuple[type, str]] = getattr(record, "OLDER_KEYS", {})
-        for name, (_, field) in older.items():
-            keys.setdefault(name, {**keys[field], "deprecated": True})
+        others: Mapping[str, str] = getattr(record, "OTHER_NAMES", {})
+        keys |= {name: keys[field] for name, field in others.items()}
         needed = {key.name for key in stated if key.default == "needed"}
         return {
             "type": "object",
             "properties": keys,
-            "required": sorted(needed - {field for _, field in older.values()}),
+            "required": sorted(needed - {*others.values()}),
             "additionalProperties": getattr(record, "OTHER_KEYS", False),
         }
 

@@ -248,7 +248,7 @@ def collect_fitted_rows(data: Measurements, are_readings_fitted: bool = False) -
 
 
 def fitted_rows_from_arrays(arrays: Mapping[str, np.ndarray]) -> FittedRows | None:
-    """Return the rows in the arrays of a run folder; None where an older version wrote it."""
+    """Return the rows in the arrays of a run folder; None where they are not known."""
     names = [name for name in arrays if name.startswith(f"{PREFIX}_")]
     if not names:
         return None

@@ -11,7 +11,7 @@ from loopcal.errors import DataError
 from loopcal.measure.instrument import Gaussian, Sensor
 from loopcal.measure.kinds import KINDS
 from loopcal.measure.kinds.distance import Distance, Separation
-from loopcal.measure.kinds.kind import SCALES, measure_progress, update_setup_name
+from loopcal.measure.kinds.kind import SCALES, measure_progress
 from loopcal.measure.kinds.poses import Component
 from loopcal.measure.kinds.position import Bearing
 from loopcal.measure.nuisance import collect_nuisance_parameters
@@ -150,5 +150,3 @@ def test_the_bias_of_a_length_is_its_offset():
     assert names == [["wire1.offset"]] * 3 + [["wire2.offset"]] * 3
     (name,) = Separation(unknown=("bias",)).nuisance_parameters
     assert name.name == "separation.offset"
-    assert update_setup_name("monday.wire1.bias.distance") == "monday.wire1.offset"
-    assert update_setup_name("tracker.bias.x") == "tracker.bias.x"

@@ -4,8 +4,7 @@
 Files and folders are written whole or not at all, and never over something else: a folder only
 over one that loopcal made. One document of each folder, such as result.json, lists under `files`
 all others and itself with their sha256. With `force`, a folder of the same kind is replaced if it
-contains these files and no others, all unchanged. Folders of versions before this list may contain
-files of known names only.
+contains these files and no others, all unchanged.
 """
 
 from __future__ import annotations
@@ -133,14 +132,13 @@ class FolderKind(NamedTuple):
     """What a command writes as a folder: `content`, such as "run", for messages.
 
     It is recognized by the file `document`, which lists the others, and the `keys` in it. `names`
-    are patterns of the other files, such as `tables/*.csv`; users fill in those in `filled_in`.
+    are patterns of the other files, such as `tables/*.csv`.
     """
 
     content: str
     document: str
     keys: tuple[str, ...]
     names: tuple[str, ...]
-    filled_in: tuple[str, ...] = ()
 
 
 def refuse_folder(path: Path, kind: FolderKind, force: bool, inputs: Sequence[Path] = ()) -> None:
@@ -188,11 +186,12 @@ def _refuse_other_content(path: Path, kind: FolderKind) -> None:
     while path.is_dir():
         with watch_folder(path.resolve()) as is_same:
             try:
-                document = _read_document(path / kind.document)
-                if document is None or any(key not in document for key in kind.keys):
+                document = _read_document(path / kind.document) or {}
+                listed = _list_digests(document)
+                if not listed or any(key not in document for key in kind.keys):
                     finding = report_finding("files.folder-of-others", content=kind.content)
                     raise FileError(finding, path)
-                listed, names = _list_digests(document), list(_list_entries(path))
+                names = list(_list_entries(path))
                 foreign = [name for name in names if not _is_expected(path, name, kind, listed)]
                 code, wrong = "files.foreign-files", foreign
                 if not foreign:
@@ -280,7 +279,7 @@ def _is_expected(path: Path, name: str, kind: FolderKind, listed: Mapping[str, s
         return False
     if entry.is_dir():
         return any(pattern.startswith(f"{name}/") for pattern in kind.names)
-    is_listed = kind.document not in listed or name in listed
+    is_listed = not listed or name in listed
     is_known = name == kind.document or any(
         name.count("/") == pattern.count("/") and fnmatchcase(name, pattern)
         for pattern in kind.names
@@ -289,11 +288,9 @@ def _is_expected(path: Path, name: str, kind: FolderKind, listed: Mapping[str, s
 
 
 def _is_changed(path: Path, name: str, kind: FolderKind, listed: Mapping[str, str]) -> bool:
-    """Return whether a file differs from what was written, as far as is known."""
+    """Return whether a listed file differs from what was written."""
     if (path / name).is_dir():
         return False
-    if name not in listed:
-        return name in kind.filled_in
     if name != kind.document:
         return sha256(path / name) != listed[name]
     digest = _quote(kind, listed[name]).encode()

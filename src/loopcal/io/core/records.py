@@ -182,19 +182,15 @@ class _RecordReader:
         hints = get_field_types(record)
         if getattr(record, "OTHER_KEYS", False):
             node = {key: value for key, value in node.items() if key in hints}
-        older: Mapping[str, tuple[type, str]] = getattr(record, "OLDER_KEYS", {})
-        renamed = {
-            field: key
-            for key, (kind, field) in older.items()
-            if key in node and field not in node and isinstance(node[key], kind)
-        }
+        others: Mapping[str, str] = getattr(record, "OTHER_NAMES", {})
+        renamed = {f: key for key, f in others.items() if key in node and f not in node}
         known = [*hints, *renamed.values()]
         refuse_unknown_keys(self.file, list(node), known, at)
         absent, values = dataclasses.MISSING, {}
         for field in (field for field in dataclasses.fields(record) if field.init):
             key = _key(field.name)
             stated = renamed.get(key, key)
-            if stated in node and (stated != key or key not in renamed.values()):
+            if stated in node:
                 values[field.name] = self.read(hints[key], node[stated], (*at, stated))
             elif field.default is absent and field.default_factory is absent:
                 raise _MisfitError(f"{_name(at)} has no key {key!r}", ". Add it", at)

@@ -488,21 +488,16 @@ def describe_stated_values(
     return content
 
 
-def _match(file: YamlFile, entries: Sequence[Parameter], stated: str) -> list[Parameter]:
-    """Return the parameters that a name, also an earlier one of an offset, or a pattern denotes."""
-    from loopcal.measure.kinds.kind import update_setup_name
-
-    pattern = update_setup_name(stated)
+def _match(file: YamlFile, entries: Sequence[Parameter], pattern: str) -> list[Parameter]:
+    """Return the parameters that a name or a pattern denotes."""
     exact = [entry for entry in entries if entry.name == pattern]
     whole = exact or [entry for entry in entries if fnmatchcase(entry.name, pattern)]
     matching = whole or [entry for entry in entries if fnmatchcase(entry.name, f"*.{pattern}")]
-    if pattern in ("distance.offset", "separation.offset"):  # once the name for all fixed points
-        matching = matching or [entry for entry in entries if entry.name.endswith(".offset")]
     if not matching:
         names = [entry.name for entry in entries]
         allowed = ", ".join(names[:12]) or "none. Give some, as 'unknown: [frame]' of the kind"
         sentence = f"this file has no setup parameter {pattern!r}{suggest_names(pattern, names)}"
-        raise file.error(f"{sentence}; it has {allowed}", (KEY, stated))
+        raise file.error(f"{sentence}; it has {allowed}", (KEY, pattern))
     return matching
 
 

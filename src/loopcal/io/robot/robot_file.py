@@ -320,9 +320,9 @@ def _read_family(file: YamlFile, known: Sequence[str]) -> str:
 
 
 def _find_drives(file: YamlFile, location: Location) -> Location:
-    """Return a location in a file that states its drives under their older key."""
-    older = location[:1] == ("drives",) and "drives" not in file.content
-    return ("actuators", *location[1:]) if older else location
+    """Return a location in a file that may state its drives as `actuators`."""
+    is_other = location[:1] == ("drives",) and "drives" not in file.content
+    return ("actuators", *location[1:]) if is_other else location
 
 
 OWN_KEYS = ("on", "mount", "joint", "family")

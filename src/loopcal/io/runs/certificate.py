@@ -418,7 +418,7 @@ def _list_budgets(budget: Mapping[str, Any]) -> Iterator[Content]:
     """Yield the standard uncertainty that each source contributes, as stated and in sum."""
     for kind, unit in (("position", r"\metre"), ("orientation", r"\radian")):
         quantities = []
-        for line in budget.get("sources") or ():
+        for line in budget.get("sources", ()):
             facts = [line.get("words") or line["kind"], f"type {line['evaluation']}"]
             if stated := line.get("stated"):
                 how = f"{stated['distribution']}, divisor {stated['divisor']:.3g}"
@@ -508,8 +508,7 @@ def _list_statements(content: Mapping[str, Any]) -> Iterator[Content]:
     expected = (content.get("expected_error") or {}).get("finding")
     if expected and content.get("states_expected_error"):
         stated.append(expected)
-    headline = content.get("headline")  # absent in runs of earlier versions
-    sentences = [*([headline] if headline else []), *(f["text"] for f in stated), SCOPE]
+    sentences = [content["headline"], *(f["text"] for f in stated), SCOPE]
     yield {"name": "Verdict, warnings and expected error", "declaration": " ".join(sentences)}
     judged = (content.get("validation") or {}).get("conformity") or {}
     decisions = [

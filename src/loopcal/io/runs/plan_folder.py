@@ -37,13 +37,7 @@ if TYPE_CHECKING:
 
 FORMAT = 1
 SHEET, DATA, RESULT = "plan.csv", "measurements.csv", "plan.json"
-PLAN = FolderKind(
-    "plan",
-    RESULT,
-    ("robot", "made_by"),
-    (SHEET, DATA, "plan.png", "curve.png"),
-    filled_in=(SHEET, DATA),
-)
+PLAN = FolderKind("plan", RESULT, ("robot", "made_by"), (SHEET, DATA, "plan.png", "curve.png"))
 VIA = "via"
 DIGITS = 12
 """Significant digits of a number: more than it was rounded to, fewer than a double has."""

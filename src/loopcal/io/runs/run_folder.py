@@ -54,7 +54,6 @@ from loopcal.io.robot.robot_file import (
     load_robot,
     remove_mark,
 )
-from loopcal.measure.kinds.kind import update_setup_name
 from loopcal.mechanism.model import Mechanism
 from loopcal.results.result import Result
 from loopcal.results.serialization import json_fields
@@ -72,14 +71,13 @@ if TYPE_CHECKING:
 
 RESULT = "result.json"
 FORMAT = 2
-"""Format of result.json; runs of format 1 lack `files`, and may lack keys that came later."""
 
 _SURROGATE = re.compile("[\ud800-\udfff]")
 """Half a character: part of a file name that is not UTF-8."""
 
 
 Number = float | None
-PARAMETERS: list[Any] = [{"name": str, "plus_minus": Number, "estimate?": Number, "unit?": str}]
+PARAMETERS: list[Any] = [{"name": str, "plus_minus": Number, "estimate": float, "unit": str}]
 SOURCE: dict[str, Any] = {
     "kind": str,
     "name": str,
@@ -99,7 +97,7 @@ BUDGET: dict[str, Any] = {
     "poses": int,
     "over": str,
     "finding": {"text": str},
-    "sources?": ([SOURCE],),  # earlier versions state none
+    "sources": [SOURCE],
 }
 VOLUME: dict[str, Any] = {
     "simultaneous": float,
@@ -116,27 +114,28 @@ VOLUME: dict[str, Any] = {
     ),
 }
 STATED: dict[str, Any] = {
-    "format": Literal[1, 2],
+    "format": int,
     "made_by": {"command": [str], "inputs": {"*": {"path": str, "sha256": str}}},
     "fit": {
         "parameters": PARAMETERS,
         "status": str,
-        "local?": PARAMETERS,  # setup parameters
-        "dropped?": ([str],),
-        "sigma_scale?": Number,
-        "noise_degrees?": Number,
-        "noise?": str,
-        "p_value?": Number,
-        "sigma_uncertainty?": Number,
+        "local": PARAMETERS,  # setup parameters
+        "dropped": [str],
+        "sigma_scale": Number,
+        "noise_degrees": Number,
+        "noise": str,
+        "p_value": Number,
+        "sigma_uncertainty": Number,
     },
-    "verdict?": (Literal["calibrated", "reservations", "not_calibrated", "undecided"],),
-    "passed?": (bool,),
-    "reasons?": [str],
-    "split?": ({"held_out": [str]},),
+    "verdict": Literal["calibrated", "reservations", "not_calibrated", "undecided"],
+    "passed": bool,
+    "reasons": [str],
+    "split": ({"held_out": [str]},),
+    "options": {"fit": {"*": Any}},
     "expected_error?": (BUDGET,),
     "volume?": (VOLUME,),
     "nulls?": {"*": str},
-    "files?": {"*": str},
+    "files": {"*": str},
 }
 """What loopcal reads back from result.json: types by key, `[of]` for a list, `(of,)` for a value
 that may be null, `*` for any key. A key with a question mark may be absent.
@@ -164,10 +163,6 @@ def get_record() -> Any:
     return make_type(STATED)
 
 
-NEEDED = ("verdict", "passed", "reasons", "split", "files")
-"""Keys that every run of format 2 states, beside those that every run states."""
-NEVER_NULL = ("verdict", "passed")
-
 ROUNDING = 1e-14
 """Relative difference of an estimate in its unit and in SI."""
 
@@ -177,19 +172,16 @@ LARGEST = 1e100
 
 def read_result(path: Path) -> dict[str, Any]:
     """Return the content of result.json of a run, of which `STATED` is checked; FileError
-    where it is no run, made by a newer loopcal, or damaged.
+    where it is no run, of another format, or damaged.
     """
     action = "restore the run folder from a copy, or repeat the calibration"
     content = read_json(path, "run result", f"this file of a run is damaged; {action}", TABLE_SIZE)
     if not isinstance(content, dict):
         raise report_damage(path, "it contains no mapping")
     number = content.get("format")
-    if isinstance(number, int) and number > FORMAT:
-        sentence = f"this run has format {number}, but this loopcal reads formats up to {FORMAT}"
-        raise FileError(f"{sentence}. Use a newer loopcal, or repeat the calibration", path)
-    for key in NEEDED if number == FORMAT else ():
-        if key not in content or (key in NEVER_NULL and content[key] is None):
-            raise report_damage(path, f"it has no {key!r}")
+    if isinstance(number, int) and number != FORMAT:
+        sentence = f"this run has format {number}, but this loopcal reads format {FORMAT}"
+        raise FileError(f"{sentence}. Calibrate again", path)
     text, plain = json.dumps(content, ensure_ascii=False), content
     if _SURROGATE.search(text):
         plain = json.loads(_SURROGATE.sub("?", text))
@@ -200,7 +192,7 @@ def read_result(path: Path) -> dict[str, Any]:
     # errors are sizes, and each table has the worst parameter
     tables = {"expected_error.parameters": budget.parameters}
     numbers = [budget.position.rms, budget.orientation.rms]
-    for i, source in enumerate(budget.sources or ()):
+    for i, source in enumerate(budget.sources):
         tables[f"expected_error.sources entry {i + 1}.parameters"] = source.parameters
         numbers += [source.position, source.orientation]
         numbers += () if source.halved is None else astuple(source.halved)
@@ -314,6 +306,7 @@ FORMS: Mapping[str, str] = {
     "frames_unfixed": "finite 12 motions",
     "frames_readings": "finite poses q",
     "frames_names": "text i",
+    "frames_by_motions": "number i 6 12",
     "frames_T": "finite i 4 4",
     "frames_by_parameters": "finite i 6 p",
     "frames_own": "finite i 6 6",
@@ -347,17 +340,7 @@ FORMS: Mapping[str, str] = {
 FITTED = "number rows values"
 """Form of the fitted rows of a kind, `fitted_<number>_<kind>`."""
 
-FIRST = ("nominal", "estimate", "sd")
-"""Arrays of every run; runs of format 1 may lack the others."""
-
-GROUPS = (
-    "frames_",
-    "discrepancy_",
-    "information_",
-    "heights_",
-    "posterior_shown_",
-    "posterior_reading_",
-)
+GROUPS = ("frames_", "discrepancy_", "heights_", "posterior_shown_", "posterior_reading_")
 """Beginnings of names of which a run has all arrays or none."""
 
 FITTED_NAME = re.compile(r"fitted_\d+_.+", re.DOTALL)
@@ -365,16 +348,13 @@ TYPES = {"finite": "f", "number": "f", "whole": "i", "logical": "b", "text": "U"
 """Word for an entry -> letter of its type in NumPy."""
 
 
-def find_problem(arrays: Mapping[str, np.ndarray], is_complete: bool = True) -> str | None:
+def find_problem(arrays: Mapping[str, np.ndarray]) -> str | None:
     """Return which array is missing or has another form, so that none of another version of
     loopcal is computed with; None where all have theirs.
-
-    arrays : name -> array. is_complete : False for format 1.
     """
     present = tuple(group for group in GROUPS if any(name.startswith(group) for name in arrays))
     for name in (name for name in FORMS if name not in arrays):
-        is_needed = name.startswith(present) if name.startswith(GROUPS) else is_complete
-        if is_needed or name in FIRST:
+        if name.startswith(present) or not name.startswith(GROUPS):
             return f"the array {name!r} is missing"
     fitted = {name: FITTED for name in arrays if name.startswith("fitted_")}
     if unknown := [name for name in fitted if not FITTED_NAME.fullmatch(name)]:
@@ -440,24 +420,16 @@ def list_reasons(failures: Iterable[object]) -> tuple[str, ...]:
 def find_run_failure(path: Path, result: Mapping[str, Any]) -> Finding | None:
     """Return why the numbers of a run are not for a machine; None where they are, or where there is
     no result, as of a robot file.
-
-    `gates.run-not-calibrated` where the run failed, or `gates.run-without-verdict` where it was
-    made before runs had a verdict and does not state that its gates were met.
     """
     if not result:
         return None
-    status = str(result.get("fit", {}).get("status", ""))
-    reasons = list_reasons(result.get("reasons") or ())
-    has_stopped = status not in ("", CONVERGED)
-    if has_stopped and not reasons:
+    status, reasons = str(result["fit"]["status"]), list_reasons(result["reasons"])
+    if status != CONVERGED and not reasons:
         reasons = (f"the fit did not converge ({status.replace('_', ' ')})",)
     # a missed limit is a reason beside the verdict: it says nothing against the geometry
-    has_failed = has_stopped or result.get("verdict") == FAILED_VERDICT
-    if has_failed or ("verdict" not in result and (reasons or result.get("passed") is False)):
-        return report_finding("gates.run-not-calibrated", run=str(path), reasons=reasons)
-    if "verdict" not in result and (status != CONVERGED or "passed" not in result):
-        return report_finding("gates.run-without-verdict", run=str(path))
-    return None
+    if status == CONVERGED and result["verdict"] != FAILED_VERDICT:
+        return None
+    return report_finding("gates.run-not-calibrated", run=str(path), reasons=reasons)
 
 
 @dataclass(frozen=True, eq=False)
@@ -504,7 +476,7 @@ class Run(Result):
     @property
     def fitted_rows(self) -> FittedRows | None:
         """The rows that the run, and those that are its prior, were fitted to; None for a robot
-        file, and for run folders of older versions.
+        file.
         """
         from loopcal.measure.fitted_rows import fitted_rows_from_arrays
 
@@ -513,7 +485,7 @@ class Run(Result):
     @property
     def held_out(self) -> tuple[str, ...]:
         """Labels of the poses that were held out for validation."""
-        return tuple((self.result.get("split") or {}).get("held_out", ()))
+        return tuple((self.result.get("split") or {"held_out": ()})["held_out"])
 
     @property
     def excluded(self) -> tuple[str, ...]:
@@ -525,7 +497,7 @@ class Run(Result):
 
         Raises
         ------
-        EstimationError : the run does not contain them, or its robot file was changed.
+        EstimationError : it is a robot file, or its robot file was changed.
         """
         from loopcal.estimate.posterior import posterior_from_arrays
 
@@ -547,7 +519,7 @@ class Run(Result):
 
     def load_uncertainty(self) -> FitUncertainty | None:
         """Return what the fit knows of machine and setup parameters together, to check other
-        measurements; None for a robot file, or a run that does not contain it.
+        measurements; None for a robot file.
         """
         from loopcal.estimate.fit_linearization import uncertainty_from_arrays
         from loopcal.estimate.residual_test import NoiseKnowledge
@@ -555,7 +527,7 @@ class Run(Result):
         if not self.result:
             return None
         fit, names = self.result["fit"], tuple(self.nuisance_values)
-        scale, noise = fit.get("sigma_scale"), NoiseKnowledge.restore(fit)
+        scale, noise = fit["sigma_scale"], NoiseKnowledge.restore(fit)
         return uncertainty_from_arrays(
             self.identified_robot, names, self.arrays, 1.0 if scale is None else scale, noise
         )
@@ -565,10 +537,10 @@ class Run(Result):
 
         Raises
         ------
-        DataError : the run has no intervals, or was made by an earlier version.
+        DataError : the run has no intervals.
         """
         budget = self.result.get("expected_error")
-        if budget is None or budget.get("sources") is None:
+        if budget is None:
             raise DataError(report_finding("files.no-budget", run=str(self.path)))
         return dict(budget)
 
@@ -611,8 +583,6 @@ def repeat_fit(
 ) -> tuple[Identification, Measurements]:
     """Return the fit of a run, made again from its files and its options, and its measurements.
 
-    Runs of earlier versions do not state their options as data; theirs are taken as the usual ones.
-
     EstimationError : the estimate is another one. DataError : an option is an object without a
         name. FileError : see `Run.load_measurements`.
     """
@@ -620,10 +590,9 @@ def repeat_fit(
     from loopcal.estimate.options import FitOptions
     from loopcal.estimate.recalibration import recalibrate
 
-    stated = run.result.get("options")
-    stated = stated if isinstance(stated, dict) else {}
+    stated = run.result["options"]
     try:
-        options = FitOptions.from_dict(stated.get("fit", {}))
+        options = FitOptions.from_dict(stated["fit"])
     except (AttributeError, TypeError, ValueError) as error:
         raise report_damage(run.path / RESULT, f"'options.fit' is {stated['fit']!r}") from error
     options = replace(options, excluded_poses=())  # they are not among the measurements
@@ -645,7 +614,7 @@ def repeat_fit(
 
 def list_inputs(result: Mapping[str, Any]) -> dict[str, Mapping[str, str]]:
     """Return role -> `path` and `sha256` of the input files of a result."""
-    return dict(result.get("made_by", {}).get("inputs", {}))
+    return dict(result["made_by"]["inputs"])
 
 
 ARRAYS = "arrays.npz"
@@ -700,8 +669,8 @@ def write_run_folder(
 def read_run_folder(path: str | Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Return the contents of result.json and arrays.npz of a run folder.
 
-    FileError : not a run folder, made by a newer loopcal, or damaged; with the file and what is
-        wrong in it.
+    FileError : not a run folder, of another format, or damaged; with the file and what is wrong
+        in it.
     """
     path = as_path(path, "run folder")
     if not (path / RESULT).is_file():
@@ -715,24 +684,21 @@ def read_run_folder(path: str | Path) -> tuple[dict[str, Any], dict[str, np.ndar
         sentence = f"this run folder lacks {' and '.join(missing)}"
         raise FileError(f"{sentence}. Restore it, or repeat the calibration", path)
     result = read_result(path / RESULT)
-    digest = result["files"].get(ARRAYS, "none") if "files" in result else None
-    if digest is not None and sha256(path / ARRAYS) != digest:
+    if sha256(path / ARRAYS) != result["files"].get(ARRAYS):
         raise report_damage(path / ARRAYS, "it is not the file that result.json names")
     try:
         arrays = read_arrays(path / ARRAYS)
     except ValueError as error:
         raise report_damage(path / ARRAYS, f"reading it fails ({error})") from error
-    if problem := find_problem(arrays, is_complete=digest is not None):
+    if problem := find_problem(arrays):
         raise report_damage(path / ARRAYS, problem)
     for name, key in (("estimate", "parameters"), ("local_estimate", "local")):
-        rows, holds = result["fit"].get(key, ()), f"but the array {name!r} of the run holds"
-        estimates = arrays[name].tolist() if name in arrays else []
-        if name in arrays and len(estimates) != len(rows):
+        rows, holds = result["fit"][key], f"but the array {name!r} of the run holds"
+        estimates = arrays[name].tolist()
+        if len(estimates) != len(rows):
             stated = f"'fit.{key}' has {len(rows)} entries, {holds} {len(estimates)}"
             raise report_damage(path / RESULT, stated)
-        for row, value in zip(rows, estimates, strict=False):
-            if row.get("estimate") is None or "unit" not in row:  # of an earlier version
-                continue
+        for row, value in zip(rows, estimates, strict=True):
             factor = UNITS[row["unit"]].factor_to_si if row["unit"] in UNITS else math.nan
             if not math.isclose(row["estimate"] * factor, value, rel_tol=ROUNDING):
                 stated = f"'fit.{key}' states {row['estimate']!r} {row['unit']} for {row['name']}"
@@ -789,12 +755,12 @@ def load_run(path: str | Path) -> Run:
 
     Raises
     ------
-    FileError : not a run folder, damaged, or made by a newer loopcal.
+    FileError : not a run folder, damaged, or of another format.
     """
     path = as_path(path, "run folder")
     result, arrays = read_run_folder(path)
     robot = load_robot(_find_robot_file(path))
-    before = arrays.get("initial", robot.parameters.nominal)
+    before = arrays["initial"]
     # others may be free, too, because a choice of the model identifies some of them
     stated, table = [row["name"] for row in result["fit"]["parameters"]], robot.parameters
     free = [name for name, is_free in zip(table.names, table.free, strict=True) if is_free]
@@ -803,9 +769,9 @@ def load_run(path: str | Path) -> Run:
         finding = report_finding("files.run-robot-changed", result=RESULT, name=name)
         raise FileError(finding, _find_robot_file(path))
     initial = robot.with_values(before)
-    names = [update_setup_name(row["name"]) for row in result["fit"].get("local", ())]
+    names = [row["name"] for row in result["fit"]["local"]]
     values, initial_values = (
-        dict(zip(names, arrays[key].tolist(), strict=True)) if key in arrays else {}
+        dict(zip(names, arrays[key].tolist(), strict=True))
         for key in ("local_estimate", "local_start")
     )
     return Run(path, result, robot, initial, values, initial_values, arrays)

@@ -20,7 +20,6 @@ m residuals (often c), u nuisance parameters of the kind, j joints that it sense
 
 from __future__ import annotations
 
-import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, Field, dataclass, field, fields, replace
@@ -141,13 +140,6 @@ def name_shared_error(kind: Kind, item: str, component: str) -> str:
     if item == BIAS and kind.bias_item != BIAS:
         return f"{owner}.{kind.bias_item}"
     return f"{owner}.{item}" if item in SCALES else f"{owner}.{item}.{component}"
-
-
-def update_setup_name(name: str) -> str:
-    """Return the present name of a setup parameter: the bias of a length was another unknown than
-    its offset before.
-    """
-    return re.sub(r"\.bias\.(distance|separation)$", ".offset", name)
 
 
 def measure_progress(session: np.ndarray, time: FloatArray | None) -> FloatArray:

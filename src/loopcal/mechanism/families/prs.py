@@ -11,9 +11,9 @@ revolute joint on it. Derivation: docs/theory/families.md.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import ClassVar, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -157,11 +157,6 @@ class CarriageRobot(RobotRecord):
     tolerances : of lengths and angles.
     """
 
-    OLDER_KEYS: ClassVar[Mapping[str, tuple[type, str]]] = {
-        **RobotRecord.OLDER_KEYS,
-        "parameters": (str, "parameter_set"),
-    }
-
     platform_radius: Length = 0.0
     base_radius: Length = 0.0
     rod: Length = 0.0
@@ -193,8 +188,7 @@ class RuPusPrs(CarriageRobot):
 
     Attributes
     ----------
-    post : its length r [m]. parameter_set : with `ideal`, the set (see the module); `parameters:`
-        with the name of a set means the same.
+    post : its length r [m]. parameter_set : with `ideal`, the set (see the module).
     """
 
     family = "ru-pus-prs"
@@ -242,8 +236,7 @@ class ThreePrs(CarriageRobot):
 
     Attributes
     ----------
-    parameter_set : with `ideal`, the `eleven` identifiable ones of each chain, or all `fourteen`;
-        `parameters:` with the name of a set means the same.
+    parameter_set : with `ideal`, the `eleven` identifiable ones of each chain, or all `fourteen`.
     """
 
     family = "3-prs"

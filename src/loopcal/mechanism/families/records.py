@@ -324,8 +324,8 @@ class RobotRecord:
         one's own, with maps onto limbs and drives.
     """
 
-    OLDER_KEYS: ClassVar[Mapping[str, tuple[type, str]]] = {"actuators": (dict, "drives")}
-    """Key -> type of its value and field that it stands for, in files of earlier versions."""
+    OTHER_NAMES: ClassVar[Mapping[str, str]] = {"actuators": "drives"}
+    """Key that a file may state -> field that it means."""
 
     family: ClassVar[str] = ""
     """Name of the family in robot files."""

@@ -204,11 +204,10 @@ class CalibrationRecord:
     arrays : content of arrays.npz [SI].
     robot : the corrected robot, of which the identified parameters are free. initial : the robot
         before the calibration.
-    posterior : of a fit that converged; None where the run has none.
-    validation : errors at held-out poses; None without any, or where an older version wrote the
-        run.
+    posterior : estimates and their uncertainty.
+    validation : errors at held-out poses; None without any.
     heights : errors of measured heights; None without any.
-    residuals : of every kind; none where an older version wrote the run.
+    residuals : of every kind.
     controllers : the values for controllers that can store them.
     facts : what people state beside the results, such as the customer, by the words for it.
     """
@@ -217,7 +216,7 @@ class CalibrationRecord:
     arrays: Mapping[str, np.ndarray] = field(repr=False)
     robot: Mechanism
     initial: Mechanism
-    posterior: Posterior | None
+    posterior: Posterior
     validation: Validation | None
     heights: HeightErrors | None
     residuals: tuple[KindResiduals, ...]
@@ -226,8 +225,8 @@ class CalibrationRecord:
 
     @property
     def verdict(self) -> Verdict:
-        """The verdict; runs of early versions state none and are undecided."""
-        return Verdict[str(self.result.get("verdict") or "undecided").upper()]
+        """The verdict."""
+        return Verdict[str(self.result["verdict"]).upper()]
 
     @property
     def converged(self) -> bool:
@@ -241,10 +240,9 @@ class CalibrationRecord:
 
     @property
     def fitted_labels(self) -> tuple[str, ...]:
-        """Labels of fitted poses, without those excluded by options; none for older runs."""
-        labels = self.arrays.get("poses")
-        excluded = self.result["fit"].get("dropped") or ()
-        return () if labels is None else tuple(n for n in labels.tolist() if n not in excluded)
+        """Labels of fitted poses, without those excluded by options."""
+        excluded = self.result["fit"]["dropped"]
+        return tuple(n for n in self.arrays["poses"].tolist() if n not in excluded)
 
     @property
     def held_out_labels(self) -> tuple[str, ...]:
@@ -264,12 +262,10 @@ UNITS = {"limit_position": "m", "limit_angle": "rad", "volume": "[m, rad]"}
 """Units of options that are numbers [SI]."""
 
 
-def list_options(options: object) -> list[tuple[str, str]]:
-    """Return name and value of each stated option; the text of a run of an earlier version."""
-    if not isinstance(options, Mapping):
-        return [("options", str(options or "unknown"))]
-    usual, fit = FitOptions().to_dict(), options.get("fit")
-    stated = {k: v for k, v in fit.items() if v != usual.get(k)} if isinstance(fit, dict) else {}
+def list_options(options: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Return name and value of each stated option."""
+    usual = FitOptions().to_dict()
+    stated = {k: v for k, v in options["fit"].items() if v != usual.get(k)}
     stated |= {key: value for key, value in options.items() if key != "fit"}
     return [
         (

@@ -92,15 +92,12 @@ def draw_residual_picture(record: CalibrationRecord) -> Iterator[Element]:
     """Yield the residuals, of many rows some, evenly spread over the order of measurement."""
     if not record.converged:
         return
-    if not record.residuals:
-        yield say("residual-figure.not-stored")
-        return
     count = sum(len(rows.raw) for rows in record.residuals)
     residuals = [thin_rows(rows, count) for rows in record.residuals]
     if count > MOST_ROWS:
         shown = sum(len(rows.raw) for rows in residuals)
         yield say("residual-figure.part", shown=shown, count=count)
-    setup = [row["name"] for row in record.result["fit"].get("local") or ()]
+    setup = [row["name"] for row in record.result["fit"]["local"]]
     yield show_figure(
         draw_residual_rows(record.robot, residuals, setup),
         "residual-figure",
@@ -153,7 +150,7 @@ def draw_height_picture(record: CalibrationRecord) -> Iterator[Element]:
 def draw_budget_picture(record: CalibrationRecord) -> Iterator[Element]:
     """Yield the sources of the expected error as bars."""
     budget = record.result.get("expected_error")
-    if budget and budget.get("sources"):
+    if budget and budget["sources"]:
         yield show_figure(draw_budget_sources(budget), "budget-figure")
 
 
@@ -172,10 +169,7 @@ def draw_scene_picture(record: CalibrationRecord) -> Iterator[Element]:
     rows, count = choose_evenly(len(readings), MOST_ROWS), len(readings)
     if len(rows) < count:
         yield say("scene-figure.part", shown=len(rows), count=count)
-    labels = record.fitted_labels
-    if len(labels) != count:  # an older version wrote the run
-        labels = tuple(str(i + 1) for i in range(count))
-    shown = tuple(labels[i] for i in rows)
+    shown = tuple(record.arrays["poses"][rows].tolist())
     poses = compute_pose_errors(record.robot, record.initial, readings[rows], shown)
     scene = Scene(record.robot, poses, accuracy, tuple(_list_motions(record)))
     in_space = len(choose_rows(record.robot, len(poses.tool)))
@@ -231,12 +225,11 @@ def draw_accuracy_picture(record: CalibrationRecord) -> Iterator[Element]:
 def compute_accuracy(record: CalibrationRecord) -> AccuracyMap | str:
     """Return the uncertainty of poses over the workspace, or the sentence why it is not known."""
     budget, readings = record.result.get("expected_error"), record.readings
-    if record.posterior is None or readings is None or not budget:
+    if readings is None or not budget:
         return say("accuracy-figure.unknown")
     measured = readings[choose_evenly(len(readings), MOST_ROWS)]
-    frame = budget.get("frame", "fitted")
     try:
-        return accuracy_map(record.posterior, measured, MAP_POSES, SEED, frame=frame)
+        return accuracy_map(record.posterior, measured, MAP_POSES, SEED, frame=budget["frame"])
     except LoopcalError as error:
         return say("accuracy-figure.failed", error=error)
 

@@ -252,7 +252,7 @@ def describe_verdict(record: CalibrationRecord) -> Iterator[Element]:
     if judged and record.validation is not None:
         yield from filter(None, [describe_commanded(record.validation)])
     yield from list_findings(f for f in select_important(record.findings) if f not in judged)
-    if recommendation := result.get("recommendation"):  # absent in runs of earlier versions
+    if recommendation := result["recommendation"]:
         yield f"Recommendation: {recommendation['text']}"
     if next_step := result.get("next_step"):
         yield f"Next: {next_step['text']}"
@@ -287,8 +287,7 @@ def describe_errors(record: CalibrationRecord) -> Iterator[Element | None]:
     """Yield the errors at held-out poses before and after, with the noise floor."""
     errors = record.validation
     if errors is None:
-        why = "computed" if record.result.get("validation") is None else "stored"
-        yield say(f"errors.not-{why if record.held_out_labels else 'held-out'}")
+        yield say(f"errors.not-{'computed' if record.held_out_labels else 'held-out'}")
         return
     explained = say("errors.baseline", is_stated_frame="stated frame" in errors.frame)
     noted = [say("errors.reading-noise")] if record.result.get("reading_errors") else []
@@ -346,7 +345,7 @@ def describe_workspace(record: CalibrationRecord) -> Iterator[Element | None]:
 def describe_budget(record: CalibrationRecord) -> Iterator[Element]:
     """Yield the uncertainty budget by source, and the stated facts of each instrument."""
     budget = record.result.get("expected_error")
-    if not budget or budget.get("sources") is None:
+    if not budget:
         yield say("budget.none")
     else:
         yield say("budget.terms")
@@ -472,23 +471,20 @@ def describe_other_findings(record: CalibrationRecord) -> Iterator[Element]:
 @describes_section("provenance", "Provenance")
 def describe_provenance(record: CalibrationRecord) -> Iterator[Element]:
     """Yield command, versions, seeds, options and digests of the files."""
-    made_by = record.result.get("made_by") or {}
+    made_by = record.result["made_by"]
     versions = made_by.get("versions", {}).items()
-    method = str(record.result["fit"].get("method") or "unknown")
-    options = record.result.get("options")
-    if isinstance(options, Mapping):  # the settings of a stated method are among them
-        method = method.partition("(")[0]
+    method = str(record.result["fit"]["method"]).partition("(")[0]  # settings are options
     rows = [
-        ("command", " ".join(made_by.get("command") or ()) or "called from Python"),
+        ("command", " ".join(made_by["command"]) or "called from Python"),
         *((n if n == "engine" else f"version of {n}", value) for n, value in versions),
         *((f"seed: {name}", str(seed)) for name, seed in made_by.get("seeds", {}).items()),
         ("method", method),
-        *list_options(options),
+        *list_options(record.result["options"]),
     ]
     value, file, digest = (word_column(t, wraps=True) for t in ("value", "file", "SHA-256"))
     yield make_table("Origin of this result", ("item", value), rows)
     files = [
-        *((f"input: {i}", f["path"], f["sha256"]) for i, f in made_by.get("inputs", {}).items()),
+        *((f"input: {i}", f["path"], f["sha256"]) for i, f in made_by["inputs"].items()),
         *(("result", *each) for each in record.result.get("files", {}).items()),
     ]
     if files:
@@ -498,7 +494,7 @@ def describe_provenance(record: CalibrationRecord) -> Iterator[Element]:
 @describes_section("poses", "Fitted and held-out poses")
 def describe_poses(record: CalibrationRecord) -> Iterator[Element]:
     """Yield the labels of the fitted and held-out poses."""
-    yield _list_labels("fitted", record.fitted_labels) or say("poses.unknown")
+    yield _list_labels("fitted", record.fitted_labels)
     yield _list_labels("held-out", record.held_out_labels) or say("poses.none")
 
 
@@ -516,14 +512,12 @@ def build_calibration_document(record: CalibrationRecord) -> Document:
 
 
 def build_head(record: CalibrationRecord) -> Document:
-    """Return a document without sections; runs of earlier versions state no headline."""
-    verdict, robot = record.verdict.value, record.robot.name
-    sentence = f"{verdict[0].upper()}{verdict[1:]}: {robot}."
+    """Return a document without sections."""
     return Document(
-        title=f"Calibration report: {robot}",
+        title=f"Calibration report: {record.robot.name}",
         verdict=record.verdict.name.lower(),
-        summary=str(record.result.get("headline") or sentence),
-        made_by=describe_maker((record.result.get("made_by") or {}).get("versions", {})),
+        summary=str(record.result["headline"]),
+        made_by=describe_maker(record.result["made_by"].get("versions", {})),
         sections=(),
     )
 
