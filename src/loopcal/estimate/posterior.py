@@ -251,7 +251,7 @@ class InstrumentFrame(NamedTuple):
     T : (4, 4) T_base_frame [m]. by_parameters : (6, p) [per SI]. own : (6, 6); both are zero for a
         frame that is stated.
     by_motions : (6, 12) by motions of the frames of base and platform, as of `frame_twists`; None
-        for a frame that is stated, and in run folders of earlier versions.
+        for a frame that is stated.
     """
 
     T: FloatArray
