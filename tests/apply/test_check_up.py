@@ -116,6 +116,28 @@ def test_impossible_checks_are_refused() -> None:
         lc.check_up(run, {"old": measure(run.robot, truth, 20, 101)})
 
 
+def test_rows_that_count_twice_and_unknown_names_are_refused() -> None:
+    run, truth = calibrate(1)
+    data = measure(run.robot, truth, 5, 82)
+    part = data.take(np.arange(5) < 2)
+    with expect_refusal("checks.rows-repeated", lc.DataError, check="copy", count=2, total=2):
+        lc.check_up(run, {"one": data, "copy": part})
+    with pytest.raises(lc.DataError, match="has the name 'd'"):
+        lc.check_up(run, {"one": data}, refit=("d",))
+
+
+def test_checks_may_measure_different_quantities() -> None:
+    run, truth = calibrate(1)
+    robot = run.robot.with_values(truth)
+    place = sample_workspace(robot, 6, seed=83).coordinates
+    instrument = lc.Instrument((lc.Sensor(lc.Separation(), lc.Gaussian(np.array([1e-5]))),))
+    lengths = lc.simulate(robot, place, instrument, 83)
+    result = lc.check_up(run, {"lengths": lengths, "places": measure(run.robot, truth, 5, 84)})
+    assert [len(check.errors) for check in result.checks] == [1, 1]
+    assert result.page()
+    assert result.plot().axes
+
+
 def test_planned_checks_run_from_the_command_line(tmp_path, monkeypatch, capsys) -> None:
     monkeypatch.chdir(tmp_path)
 

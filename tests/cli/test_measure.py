@@ -89,6 +89,11 @@ def test_the_suggested_pose_needs_no_name(measure, rows) -> None:
     assert read_used() == [first]
 
 
+def test_a_chosen_pose_is_the_one_that_comes_next(measure, rows) -> None:
+    said = measure([f"pose {rows[4][0]}"]).words
+    assert f"next: pose {rows[4][0]}, as you chose Command pose {rows[4][0]}:" in said
+
+
 def test_a_wrong_row_is_left_out_and_its_repeat_used(measure, rows) -> None:
     given = [*map(join, rows[:6]), wrong(rows[6]), join(rows[6])]
     measure(given, f"pose {rows[6][0]} does not fit: x differs", "Its earlier row was wrong")

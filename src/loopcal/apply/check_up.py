@@ -21,7 +21,13 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from loopcal.apply.validation import find_error_units, owner_of, report_reused_rows
+from loopcal.apply.validation import (
+    REFUSED_SHARE,
+    find_error_units,
+    match_owners,
+    owner_of,
+    report_reused_rows,
+)
 from loopcal.diagnose.blunders import Predictor
 from loopcal.diagnose.row_errors import compare_predictions, compute_row_errors
 from loopcal.errors import DataError, EstimationError
@@ -30,6 +36,7 @@ from loopcal.estimate.recalibration import ErrorPart, JudgedChange, ParameterCha
 from loopcal.estimate.residual_test import DOUBT
 from loopcal.findings import Finding, Severity, report_finding
 from loopcal.measure.data_checks import check_actuators, check_types
+from loopcal.measure.fitted_rows import FittedRows, collect_fitted_rows
 from loopcal.measure.kinds.kind import SCALES
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.readings import fill_in_reading_sigma
@@ -110,7 +117,7 @@ class CheckUp(DrawnResult):
         for name, stated in self.units.items():
             unit = choose_unit(stated, (check.errors.get(name) for check in self.checks))
             heading = Column(f"{name} error, rms", unit.symbol)
-            columns.append((heading, lambda c, q=name, u=unit: format_in(u, c.errors[q], 3)))
+            columns.append((heading, lambda c, q=name, u=unit: _format_error(c, q, u)))
         table = build_table("Checks since the calibration", self.checks, *columns)
         return [*map(str, self.findings), "", table]
 
@@ -134,6 +141,11 @@ class CheckUp(DrawnResult):
         return "\n".join(f"{f.severity.value}: {f}" for f in self.findings)
 
     __repr__ = __str__
+
+
+def _format_error(check: Check, quantity: str, unit: Unit) -> str:
+    """Return an error of a check, empty for what it did not measure."""
+    return format_in(unit, check.errors[quantity], 3) if quantity in check.errors else ""
 
 
 class CheckRows(NamedTuple):
@@ -170,8 +182,8 @@ def check_up(
     run : of the calibration, as from `load_run`. checks : name -> measurements, in order of time.
     false_alarms : probability of any false alarm within a year, above 0 and below 1.
     a_year : number of checks within it.
-    refit : names of targets or surfaces that moved since the calibration. The frame and the scale
-        of an instrument are determined by each check in any case.
+    refit : names of targets or surfaces, such as `ball*`, that moved since the calibration. The
+        frame and the scale of an instrument are determined by each check in any case.
 
     Raises
     ------
@@ -189,9 +201,14 @@ def check_up(
     units: dict[str, Unit] = {}
     notes: list[Finding] = []
     data = judged = None
+    refit, seen = tuple(sorted(match_owners(refit, *checks.values()))), FittedRows()
     for name, data in checks.items():
         reused = report_reused_rows(run.fitted_rows, data)
         notes += [] if reused is None else [reused]
+        again = seen.find_in(data)
+        if again.count and again.count >= REFUSED_SHARE * again.total:
+            raise DataError(report_finding("checks.rows-repeated", check=name, **again._asdict()))
+        seen = seen.joined(collect_fitted_rows(data))
         made, errors = _collect_rows(run, uncertainty, data, refit)
         rows.append(made)
         units |= find_error_units(run.robot, errors)

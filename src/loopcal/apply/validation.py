@@ -343,20 +343,9 @@ def validate(
         nuisance_values_before = nuisance.starts if is_usual and nuisance is not None else {}
     if nuisance_values is None:
         nuisance_values = {} if nuisance is None else nuisance.values
-    owners = {owner_of(name) for name in data.nuisance_parameters.table.names}
-    for pattern in refit:
-        if not any(fnmatchcase(owner, pattern) for owner in owners):
-            listed = ", ".join(sorted(owners)) or "none"
-            raise DataError(
-                f"no frame, target or surface of these data has the name {pattern!r}"
-                f"{suggest_names(pattern, owners)}; the data have: {listed}"
-            )
+    refitted = match_owners(refit, data)
     kept_before, kept = (
-        {
-            name: value
-            for name, value in values.items()
-            if not any(fnmatchcase(owner_of(name), pattern) for pattern in refit)
-        }
+        {name: value for name, value in values.items() if owner_of(name) not in refitted}
         for values in (nuisance_values_before, nuisance_values)
     )
     compared = compare_predictions(old or robot.nominal, robot, data, kept_before, kept)
@@ -632,6 +621,22 @@ def _find_largest(blunders: Sequence[Blunder], errors: Validation) -> list[dict[
                     error = Quantity(size / unit.factor_to_si, unit.symbol)
                     results[i] = {"quantity": quantity, "target": target, "error": error}
     return results
+
+
+def match_owners(patterns: Sequence[str], *data: Measurements) -> set[str]:
+    """Return the frames, targets and surfaces of measurements that patterns such as `tracker*`
+    name; refuse one that names none.
+    """
+    tables = [each.nuisance_parameters.table for each in data]
+    owners = {owner_of(name) for table in tables for name in table.names}
+    for pattern in patterns:
+        if not any(fnmatchcase(owner, pattern) for owner in owners):
+            listed = ", ".join(sorted(owners)) or "none"
+            raise DataError(
+                f"no frame, target or surface of these data has the name {pattern!r}"
+                f"{suggest_names(pattern, owners)}; the data have: {listed}"
+            )
+    return {o for o in owners if any(fnmatchcase(o, pattern) for pattern in patterns)}
 
 
 def report_reused_rows(fitted: FittedRows | None, data: Measurements) -> Finding | None:

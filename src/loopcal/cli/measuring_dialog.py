@@ -98,10 +98,10 @@ class Dialog:
         self._write()
         inputs = self._list_inputs()
         while True:
-            following = choose_next(self.state, self.skipped)
+            following = choose_next(self.state, self.skipped, self.chosen)
             self.progress = report_progress(self.state, following)
             self.say(*self.progress)
-            pose = following.pose if self.chosen is None else self.chosen
+            pose = following.pose
             if pose is None and self.export is not None:
                 return
             if pose is not None:

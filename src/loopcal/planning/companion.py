@@ -548,15 +548,16 @@ def predict_accuracy(companion: Companion, more: Sequence[int] = ()) -> Expected
     return replace(errors, **{name: scale * getattr(errors, name) for name in names})
 
 
-Reason = Literal["repeat", "check", "best", "again", "validate", "done"]
+Reason = Literal["chosen", "repeat", "check", "best", "again", "validate", "done"]
 
 
 @dataclass(frozen=True, eq=False)
 class NextPose:
     """What to measure next.
 
-    reason : "repeat" a row that did not fit, "check" for drift, "best" by gain per minute, "again"
-        because the sheet has no other pose, "validate" with a held-out pose, or "done".
+    reason : "chosen" by the operator, "repeat" a row that did not fit, "check" for drift, "best" by
+        gain per minute, "again" because the sheet has no other pose, "validate" with a held-out
+        pose, or "done".
     pose : place in the sheet; None where nothing is left. via_home : whether the straight path from
         the last pose is not allowed.
     left : number of fit poses to the goal, or of the sheet without a goal; None where MOST_REPEATS
@@ -571,8 +572,10 @@ class NextPose:
     minutes: float | None
 
 
-def choose_next(companion: Companion, skipped: Sequence[int] = ()) -> NextPose:
-    """Return what to measure next; `skipped` poses of the sheet are not suggested."""
+def choose_next(
+    companion: Companion, skipped: Sequence[int] = (), chosen: int | None = None
+) -> NextPose:
+    """Return what to measure next: the chosen pose, or one of the sheet that is not `skipped`."""
     task, problem = companion.task, companion.task.problem
     goal, target, at = problem.options.goal, problem.options.target, problem.candidates.coordinates
     here = at[companion.poses[-1]] if companion.poses else locate_home(task.robot)
@@ -601,7 +604,9 @@ def choose_next(companion: Companion, skipped: Sequence[int] = ()) -> NextPose:
     fitted, going = companion.fitted, order if left or (left is None and free) else []
     since = companion.poses[::-1].index(fitted[0]) if fitted else 0
     pose = None
-    if pending:
+    if chosen is not None:
+        reason, pose = "chosen", chosen
+    elif pending:
         reason, pose = "repeat", pending[-1]
     elif 0 < task.check_every <= since and (going or validating):
         reason, pose = "check", fitted[0]
