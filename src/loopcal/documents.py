@@ -47,8 +47,8 @@ from loopcal.version import __version__
 # Records of calibrations from reports in memory and from run folders, with controllers'
 # values.
 
+# Formats that take every robot and belong to no controller, and programs, which nobody types.
 GENERAL = ("json", "csv", "c", "linuxcnc-kinematics")
-"""Formats that take every robot and belong to no controller, and programs, which nobody types."""
 
 
 def load_record(
@@ -102,8 +102,7 @@ def list_controllers(source: ExportSource) -> tuple[ControllerValues, ...]:
 
 
 SHORT_HTML = ".htm"
-HTML = (".html", SHORT_HTML)
-"""Endings of a page's name."""
+HTML = (".html", SHORT_HTML)  # endings of a page's name
 
 
 def save_report(
@@ -172,8 +171,7 @@ def check_ending(path: Path, what: str, endings: tuple[str, ...] = HTML) -> str:
 
 # Write a comparison of calibrations: HTML for people, JSON and CSV for programs.
 
-ENDINGS = (*HTML, ".json", ".csv")
-"""Endings of the files of a comparison."""
+ENDINGS = (*HTML, ".json", ".csv")  # endings of the files of a comparison
 
 
 def save_comparison(comparison: RunComparison, path: str | Path) -> Path:
@@ -216,17 +214,12 @@ def save_comparison(comparison: RunComparison, path: str | Path) -> Path:
 
 # Print an HTML file to PDF with an installed Chromium.
 
+# Names of programs that print, in the order in which they are tried.
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
-"""Names of programs that print, in the order in which they are tried."""
-
 OPTIONS = ("headless", "disable-gpu", "no-pdf-header-footer", "no-first-run")
 OPTIONS += ("disable-background-networking", "disable-extensions")
-SANDBOX = ("no-sandbox",)
-"""Options of the browser; the last for root, for whom it has no sandbox."""
-
-SECONDS = 120
-"""Time that a browser gets to print a report."""
-
+SANDBOX = ("no-sandbox",)  # options of the browser; the last for root, for whom it has no sandbox
+SECONDS = 120  # time that a browser gets to print a report
 _END = re.compile(rb"%%EOF\s*\Z")
 
 

@@ -15,6 +15,10 @@ from typing import Any
 from loopcal.errors import LoopcalError, MissingPackageError
 from loopcal.findings import report_finding
 
+# Variables by which libraries of linear algebra choose their threads, before numpy is imported. One
+# thread makes the last digits of results independent of the machine's settings. It is also the
+# fastest, because the matrices are small and threads wait for each other (5000 poses on two cores:
+# 0.3 s with one thread, 5 s and more with two).
 THREADS = (
     "OMP_NUM_THREADS",
     "OPENBLAS_NUM_THREADS",
@@ -23,22 +27,15 @@ THREADS = (
     "BLIS_NUM_THREADS",
     "VECLIB_MAXIMUM_THREADS",
 )
-"""Variables by which libraries of linear algebra choose their threads, before numpy is imported.
-
-One thread makes the last digits of results independent of the machine's settings. It is also the
-fastest, because the matrices are small and threads wait for each other (5000 poses on two cores:
-0.3 s with one thread, 5 s and more with two).
-"""
 
 
+# Variables of this process and of those that it starts, and their values. Without the last two,
+# Python imports modules from the current folder where it runs a module, as workers do, and Windows
+# looks for programs there.
 PINNED = dict.fromkeys(THREADS, "1") | {
     "PYTHONSAFEPATH": "1",
     "NoDefaultCurrentDirectoryInExePath": "1",
 }
-"""Variables of this process and of those that it starts, and their values. Without the last two,
-Python imports modules from the current folder where it runs a module, as workers do, and Windows
-looks for programs there.
-"""
 
 
 def pin_settings() -> None:

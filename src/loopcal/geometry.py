@@ -25,9 +25,7 @@ from loopcal.units import Dimension
 # Added to squared lengths before the square root: far below any square that matters, far above the
 # smallest float.
 _TINY = 1e-200
-
-_HAT = np.zeros((3, 9))
-"""Entries of `hat(w)`, row by row, by those of w."""
+_HAT = np.zeros((3, 9))  # entries of `hat(w)`, row by row, by those of w
 _HAT[0, [5, 7]], _HAT[1, [2, 6]], _HAT[2, [1, 3]] = (-1.0, 1.0), (1.0, -1.0), (-1.0, 1.0)
 
 
@@ -202,8 +200,7 @@ def project_to_rotations(matrix: FloatArray) -> FloatArray:
 
 # Poses as 4x4 matrices, and the twist by which loopcal updates and compares them.
 
-_LAST = np.ones((1, 1))
-"""The last number of the last row of a pose."""
+_LAST = np.ones((1, 1))  # the last number of the last row of a pose
 
 
 def make_pose(rotation: FloatArray, translation: FloatArray) -> FloatArray:
@@ -283,7 +280,6 @@ def differentiate_by_entries(T: FloatArray) -> FloatArray:
 
 _SEQUENCES = ("xyz", "yzx", "zxy", "xzy", "yxz", "zyx", "xyx", "xzx", "yxy", "yzy", "zxz", "zyz")
 EULER_ORDERS = _SEQUENCES + tuple(sequence.upper() for sequence in _SEQUENCES)
-
 # Below this cosine (or sine) of the middle angle [1], a few ulps, two axes are parallel and the
 # first angle is set to zero.
 _GIMBAL = 1e-15
@@ -421,8 +417,8 @@ def _nonzero(divisor: FloatArray) -> FloatArray:
     return np.where(divisor == 0.0, 1e-100, divisor)
 
 
+# Matrix from tilt and torsion (phi, theta, psi) to Euler angles "ZYZ" (phi, theta, psi - phi).
 TO_ZYZ = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 1.0]])
-"""Matrix from tilt and torsion (phi, theta, psi) to Euler angles "ZYZ" (phi, theta, psi - phi)."""
 
 
 def tilt_torsion_to_matrix(angles: FloatArray) -> FloatArray:
@@ -575,34 +571,27 @@ _SIGNED_PERMUTATIONS = [
     for order in permutations(range(3))
     for sign in product((1.0, -1.0), repeat=3)
 ]
+# The 24 rotations (24, 3, 3) of a cube: every rotation is within 63 degrees of one of them.
 OCTAHEDRAL_ROTATIONS: FloatArray = np.array(
     [R for R in _SIGNED_PERMUTATIONS if np.linalg.det(R) > 0.0]
 )
-"""The 24 rotations (24, 3, 3) of a cube: every rotation is within 63 degrees of one of them."""
 OCTAHEDRAL_ROTATIONS.setflags(write=False)
 
-TINY = 1e-300
-"""Divisor [1] in place of zero."""
-
-FLATNESS = 1e-6
-"""Ratio of extents [1] below which points count as coplanar, or as collinear."""
-
+TINY = 1e-300  # divisor [1] in place of zero
+FLATNESS = 1e-6  # ratio of extents [1] below which points count as coplanar, or as collinear
+# Change of a rotation [rad] that ends `solve_directions` and `minimize_over_rotations`; a descent
+# refines the result anyway.
 ROTATION_CHANGE = 1e-6
-"""Change of a rotation [rad] that ends `solve_directions` and `minimize_over_rotations`; a descent
-refines the result anyway.
-"""
 
 NEWTON_STEPS, FLATTEST, ROUNDING = 40, 1e-9, 1e-15
 """Steps of Newton's method on rotations, of which a dozen are usual; the curvature, as a share of
 the trace of its form, below which a direction counts as flat; the rounding of values of the form.
 """
 
-GENERATORS = hat(np.eye(3))
-"""Matrices (3, 3, 3) of the cross products with the three axes."""
+GENERATORS = hat(np.eye(3))  # matrices (3, 3, 3) of the cross products with the three axes
 GENERATORS.setflags(write=False)
 
-ALIGNMENT_TOLERANCE = 1e-9
-"""Singular values below this share of the largest count as zero [1]."""
+ALIGNMENT_TOLERANCE = 1e-9  # singular values below this share of the largest count as zero [1]
 
 ANCHOR_TOLERANCE, ANCHOR_RANK = 1e-6, 4
 """Relative singular value [1] below which positions do not determine the anchor of a line, and the

@@ -35,12 +35,12 @@ from loopcal.measure.kinds.kind import Kind
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations
 from loopcal.mechanism.model import Mechanism
-from loopcal.numerics.distributions import beta_probability
 from loopcal.numerics.elimination import TreeElimination
 from loopcal.numerics.split_columns import EXPLAINED, SplitColumns, span_columns, split_columns
 from loopcal.numerics.statistics import (
     Remainder,
     VarianceComponent,
+    beta_probability,
     choose_evenly,
     compute_f_tail,
     find_distinct,

@@ -35,12 +35,12 @@ from loopcal.measure.readings import list_sensed_joints, select_joint_values
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import read_coordinates
 from loopcal.mechanism.solutions import Solution, inverse, make_solution
-from loopcal.numerics.distributions import student_probability
 from loopcal.numerics.statistics import (
     NEAR_ONE,
     compute_chi_square_quantile,
     compute_chi_square_tail,
     invert_increasing,
+    student_probability,
 )
 from loopcal.numerics.trial_batch import map_arrays
 from loopcal.parameters import ParameterTable

@@ -19,8 +19,7 @@ from typing import ClassVar, Protocol, TypeVar
 import numpy as np
 
 from loopcal.errors import DataError, EstimationError
-from loopcal.numerics.distributions import normal_probability
-from loopcal.numerics.statistics import compute_chi_square_quantile
+from loopcal.numerics.statistics import compute_chi_square_quantile, normal_probability
 from loopcal.registry import Registry
 from loopcal.typing import FloatArray
 

@@ -194,7 +194,6 @@ def find_foreign_setting(plain: Mapping[str, Any]) -> tuple[str, str] | None:
 
 
 NO_LOSS = "none"  # name of the loss None
-
 OBJECT = "object"  # key of the text of an object that has no name
 
 

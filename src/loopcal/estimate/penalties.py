@@ -154,7 +154,6 @@ def _gcv(decomposition: Decomposition, penalty: FloatArray) -> FloatArray:
 # along weak combinations costs hundreds of steps; with 3, errors of five assumed tolerances would
 # be further than their standard deviation.
 HOLD = 5.0
-
 # Standard deviation of a combination, in assumed tolerances, beyond which no descent is tried
 # without that prior: a tenth of the robot's size, and 0.1 rad. Up to 27, most fits converge.
 WEAKEST = 100.0

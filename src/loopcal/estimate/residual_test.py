@@ -29,8 +29,12 @@ import numpy as np
 
 from loopcal.findings import Finding, Severity, report_finding
 from loopcal.numerics.decomposition import Decomposition
-from loopcal.numerics.distributions import normal_quantile, student_quantile
-from loopcal.numerics.statistics import compute_chi_square_tail, compute_f_tail
+from loopcal.numerics.statistics import (
+    compute_chi_square_tail,
+    compute_f_tail,
+    normal_quantile,
+    student_quantile,
+)
 from loopcal.typing import FloatArray
 
 FALSE_ALARMS: Mapping[str, float] = {

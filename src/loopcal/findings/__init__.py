@@ -97,6 +97,7 @@ def report_finding(code: str, severity: Severity | None = None, **data: Any) -> 
     return Finding(code, entry.severity if severity is None else severity, data)
 
 
+# Codes of findings, most important first. Codes that are absent here come after these.
 IMPORTANCE = """
 fit.bad-start fit.no-descent fit.no-progress fit.out-of-iterations
 gates.poses-unreachable gates.errors-grew
@@ -121,7 +122,6 @@ prior.machine-unchanged model.simpler-suffices model.all-needed model.expected-g
 residuals.start-not-calibrated residuals.start-within-noise residuals.start-is-best
 prior.undetectable prior.inflation
 """
-"""Codes of findings, most important first. Codes that are absent here come after these."""
 
 
 def sort_by_importance(findings: Iterable[Finding]) -> tuple[Finding, ...]:

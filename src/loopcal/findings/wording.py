@@ -29,9 +29,7 @@ from collections.abc import Mapping, Sequence, Sized
 from functools import cache
 from typing import Any, NamedTuple
 
-SHOWN_NAMES = 10
-"""Names that a sentence lists before it counts the others."""
-
+SHOWN_NAMES = 10  # names that a sentence lists before it counts the others
 _PYTHON = string.Formatter()
 
 
@@ -44,8 +42,7 @@ FINER = {"m": ("mm", 1e3), "mm": ("um", 1e3), "um": ("nm", 1e3), "rad": ("mrad",
 FINER |= {"mrad": ("urad", 1e3), "deg": ("urad", 1e6 * math.pi / 180.0)}
 """Unit -> the next finer one, and its number of them."""
 
-SMALL = 0.01
-"""Numbers below this are read in a finer unit: 7 um instead of 0.007 mm."""
+SMALL = 0.01  # numbers below this are read in a finer unit: 7 um instead of 0.007 mm
 
 
 def choose_symbol(size: float, symbol: str) -> tuple[str, float]:
@@ -83,8 +80,7 @@ def round_to_digits(value: float, digits: int = 3) -> str:
     return write_small(f"{value:.{digits}g}")
 
 
-SMALLEST = 7
-"""Largest negative power of ten that is written as zeros, as beside larger numbers."""
+SMALLEST = 7  # largest negative power of ten that is written as zeros, as beside larger numbers
 
 
 def write_small(number: str) -> str:

@@ -17,7 +17,7 @@ import numpy as np
 
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.readings import find_steps
-from loopcal.numerics.distributions import binomial_tail
+from loopcal.numerics.statistics import binomial_tail
 from loopcal.typing import BoolArray, FloatArray
 
 SAME = 1e-8  # share of what a column spans up to which two numbers are the same

@@ -20,8 +20,7 @@ from loopcal.measure.observations import Observations
 from loopcal.mechanism.chains import select_platform_entries
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.solutions import Solution, inverse
-from loopcal.numerics.distributions import binomial_tail
-from loopcal.numerics.statistics import compute_median
+from loopcal.numerics.statistics import binomial_tail, compute_median
 from loopcal.typing import FloatArray, IntArray
 from loopcal.units import SMALLEST_SD, Dimension
 

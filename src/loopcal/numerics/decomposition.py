@@ -20,31 +20,23 @@ from loopcal import engine
 from loopcal.numerics.trial_batch import TrialBatch
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
+# Singular values below this share of the largest count as zero. The matrix must be whitened and its
+# columns scaled. Null directions of an exact model come out at 1e-17 to 1e-13 by double rounding;
+# the weakest genuine directions seen in complete error models of real machines are near 1e-9.
 RANK_TOLERANCE = 1e-11
-"""Singular values below this share of the largest count as zero.
-
-The matrix must be whitened and its columns scaled. Null directions of an exact model come out at
-1e-17 to 1e-13 by double rounding; the weakest genuine directions seen in complete error models of
-real machines are near 1e-9.
-"""
-
+# The same rule for columns that are eliminated (frames, targets, surfaces, offsets, poses). It is
+# ten times wider than RANK_TOLERANCE: these columns have passed the eliminations of the scopes
+# inside them, each with its rounding, and a direction that is wrongly called observable would take
+# a genuine equation away from the machine.
 NUISANCE_TOLERANCE = 1e-10
-"""The same rule for columns that are eliminated (frames, targets, surfaces, offsets, poses).
-
-It is ten times wider than RANK_TOLERANCE: these columns have passed the eliminations of the scopes
-inside them, each with its rounding, and a direction that is wrongly called observable would take a
-genuine equation away from the machine.
-"""
-
+# A parameter has infinite variance when null directions carry more than this of its unit vector
+# (sqrt of rounding).
 NULL_COMPONENT = 1e-8
-"""A parameter has infinite variance when null directions carry more than this of its unit vector
-(sqrt of rounding).
-"""
 
 
+# A null direction has no part in parameters that carry less than this of it: weak directions, of
+# 1e-9 of the largest singular value, turn null directions by 1e-7 in double rounding.
 NULL_PART = 1e-5
-"""A null direction has no part in parameters that carry less than this of it: weak directions, of
-1e-9 of the largest singular value, turn null directions by 1e-7 in double rounding."""
 
 
 def are_nonzero(singular_values: np.ndarray, tolerance: float = RANK_TOLERANCE) -> BoolArray:
@@ -305,8 +297,8 @@ class Decomposition(TrialBatch):
         return part > NULL_COMPONENT**2
 
 
+# Sine of the angle up to which null directions of two linearizations are the same direction.
 PARALLEL = 1e-2
-"""Sine of the angle up to which null directions of two linearizations are the same direction."""
 
 
 def find_null_space(rows: FloatArray) -> FloatArray:
@@ -417,8 +409,8 @@ def _split(
 # Systems with one triangular matrix and many right sides, by numpy.
 
 
+# Unknowns of a triangle that is solved at once, by LU: the time of more grows with their cube.
 LEAF = 64
-"""Unknowns of a triangle that is solved at once, by LU: the time of more grows with their cube."""
 
 
 def substitute_backward(R: FloatArray, b: FloatArray) -> FloatArray:
@@ -445,16 +437,14 @@ def substitute_transposed(R: FloatArray, b: FloatArray) -> FloatArray:
 # Upper triangular systems R x = b of many trials, and how far each R is from a singular
 # matrix.
 
+# Unknowns that are solved for at once: the time of small systems is that of the call, the time of
+# large ones is spent on zeros below the diagonal.
 PART = 12
-"""Unknowns that are solved for at once: the time of small systems is that of the call, the time of
-large ones is spent on zeros below the diagonal."""
-
+# A smallest singular value counts as certainly above a tolerance where its bound is this many times
+# as large: far more than the rounding of bounds and decompositions.
 MARGIN = 2.0
-"""A smallest singular value counts as certainly above a tolerance where its bound is this many
-times as large: far more than the rounding of bounds and decompositions."""
-
+# Share of the norm below which rounding could decide whether a singular value counts.
 ROUNDING = 1e-12
-"""Share of the norm below which rounding could decide whether a singular value counts."""
 
 
 def solve_triangles(triangle: FloatArray, right: FloatArray) -> FloatArray:

@@ -29,8 +29,8 @@ from loopcal.typing import BoolArray, FloatArray, IntArray
 # The elimination tree: in which order unknowns of different scopes are eliminated.
 
 TARGET = "target"
+# Scopes of unknowns, from the outermost to the innermost.
 SCOPES = ("machine", "session", "group", "pose", TARGET)
-"""Scopes of unknowns, from the outermost to the innermost."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -238,9 +238,9 @@ def _sort_by_structure(node: IntArray, parent: IntArray, cluster: IntArray) -> E
     )
 
 
+# Unobservable directions have at least length one when they are carried inwards. Shorter ones are
+# rounding.
 SHORTEST_DIRECTION = 0.5
-"""Unobservable directions have at least length one when they are carried inwards. Shorter ones are
-rounding."""
 
 
 class NodeFactors:
@@ -529,8 +529,8 @@ def _carry_inwards(
     return carried, clusters
 
 
+# Numbers that are decomposed together, about: more of them take memory and save no time.
 FOLDED = 2_000_000
-"""Numbers that are decomposed together, about: more of them take memory and save no time."""
 
 
 def fold_at(factor: FloatArray, rows: FloatArray, places: IntArray) -> FloatArray:
@@ -610,10 +610,9 @@ def _fold_in_place(out: FloatArray, used: int, rows: FloatArray, places: IntArra
 
 # Derivatives that are nothing but rounding.
 
+# Share of the size of its terms below which a sum of a few products is rounding: some thousand
+# units of the last place.
 ROUNDING = 1e-12
-"""Share of the size of its terms below which a sum of a few products is rounding: some thousand
-units of the last place.
-"""
 
 
 def without_rounding(values: FloatArray, size: FloatArray) -> FloatArray:
@@ -630,8 +629,8 @@ def without_rounding(values: FloatArray, size: FloatArray) -> FloatArray:
 
 # Elimination of leading columns of stacked rows by orthogonal projection.
 
+# Rows that the projection leaves shorter than this share of the largest are rounding.
 SMALLEST_ROW = 1e-14
-"""Rows that the projection leaves shorter than this share of the largest are rounding."""
 
 
 @dataclass(frozen=True, eq=False)

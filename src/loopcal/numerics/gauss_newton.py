@@ -21,8 +21,8 @@ import numpy as np
 from loopcal.numerics.elimination import shorten_rows
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
+# Relative change of a sum of squares that is rounding and says nothing about a step.
 ROUNDING = 1e-12
-"""Relative change of a sum of squares that is rounding and says nothing about a step."""
 
 
 class DescentStatus(IntEnum):
@@ -118,17 +118,14 @@ def minimize_by_halving(
     return point, converged
 
 
-STEPS = 60
-"""Steps of damped Gauss-Newton [1]; starts in the right basin need fewer than ten."""
+STEPS = 60  # steps of damped Gauss-Newton [1]; starts in the right basin need fewer than ten
 
 FIRST_DAMPING, LARGEST_DAMPING = 1e-4, 1e4
 """Damping of the first step [1], in columns of length one, and that at which a descent ends."""
 
+# Step, in standard deviations or as a share of the residuals, that is as good as none.
 NEGLIGIBLE_STEP = 1e-6
-"""Step, in standard deviations or as a share of the residuals, that is as good as none."""
-
-SMALLEST = 1e-12
-"""Singular value of columns of length one that counts as zero."""
+SMALLEST = 1e-12  # singular value of columns of length one that counts as zero
 
 Linearize = Callable[[FloatArray, IntArray], tuple[FloatArray, FloatArray]]
 """From values (c, u) of starts, whose numbers are (c,), to residuals (c, M), in units of their

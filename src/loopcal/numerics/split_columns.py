@@ -17,8 +17,7 @@ from loopcal.numerics.elimination import find_connected_groups
 from loopcal.numerics.statistics import find_distinct
 from loopcal.typing import FloatArray, IntArray
 
-EXPLAINED = 1e-6
-"""Share of its length below which a column counts as explained by other columns."""
+EXPLAINED = 1e-6  # share of its length below which a column counts as explained by other columns
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,28 +1,50 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tests by the chi-square and F distributions, and variance components."""
+"""Probabilities and quantiles of the normal, chi-square, F, t and beta distributions; tests by
+these, and variance components.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from importlib import import_module
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from loopcal.numerics.distributions import (
-    chi_square_quantile,
-    chi_square_tail,
-    f_quantile,
-    f_tail,
-    normal_probability,
-)
 from loopcal.typing import FloatArray, IntArray
 
 if TYPE_CHECKING:
     from loopcal.numerics.split_columns import SplitColumns
 
-NODES = 101
-"""Values of the true noise of each source over which a probability is averaged."""
+
+NODES = 101  # values of the true noise of each source over which a probability is averaged
+Distribution = Callable[..., FloatArray]
+
+
+def _distribution(name: str) -> Distribution:
+    """Return a function of `scipy.special`, whose arguments broadcast. It is imported when one is
+    called: its import takes twice as long as that of numpy, and `import loopcal` does not pay for
+    it.
+    """
+
+    def evaluate(*arguments: ArrayLike) -> FloatArray:
+        return np.asarray(getattr(import_module("scipy.special"), name)(*arguments), dtype=float)
+
+    return evaluate
+
+
+normal_probability = _distribution("ndtr")  # of at most x
+normal_quantile = _distribution("ndtri")  # value that is not exceeded with a probability
+chi_square_tail = _distribution("chdtrc")  # probability of more than x with k degrees of freedom
+# value that chi-square of k degrees of freedom exceeds with a probability
+compute_chi_square_quantile = _distribution("chdtri")
+f_tail = _distribution("fdtrc")  # probability of more than x with k and `left` degrees of freedom
+f_quantile = _distribution("fdtri")  # value that is not exceeded with a probability
+student_probability = _distribution("stdtr")  # of at most t with some degrees of freedom
+student_quantile = _distribution("stdtrit")  # value of t that is not exceeded with a probability
+beta_probability = _distribution("betainc")  # of at most x, of the parameters a and b
+binomial_tail = _distribution("bdtrc")  # probability of more than k of n trials
 
 
 def compute_chi_square_tail(degrees: ArrayLike, statistic: ArrayLike) -> FloatArray:
@@ -51,11 +73,6 @@ def compute_f_tail(degrees: ArrayLike, left: ArrayLike, statistic: ArrayLike) ->
     return np.where(left > 0.0, np.where(degrees > 0.0, tail, 1.0), np.nan)
 
 
-def compute_chi_square_quantile(degrees: ArrayLike, probability: ArrayLike) -> FloatArray:
-    """Return the statistic that chi-square exceeds with a probability."""
-    return chi_square_quantile(degrees, probability)
-
-
 def compute_f_quantile(degrees: ArrayLike, left: ArrayLike, probability: ArrayLike) -> FloatArray:
     """Return the statistic that F exceeds with a probability; `left` are the degrees of freedom of
     the estimated noise, infinite for a known one: chi-square over `degrees`.
@@ -82,15 +99,14 @@ def compute_averaged_tail(
     probability = (np.arange(NODES) + 0.5) / NODES
     true = np.zeros(1)
     for part, nu in sources:
-        times = np.ones(1) if np.isinf(nu) else nu / chi_square_quantile(nu, probability)
+        times = np.ones(1) if np.isinf(nu) else nu / compute_chi_square_quantile(nu, probability)
         true = (true[:, None] + part / total * times).ravel()
     return float(compute_chi_square_tail(degrees, chi_square / true).mean())
 
 
 # Levels and probabilities where several tests are made at once.
 
-NEAR_ONE = 1.0 - 1e-16
-"""Largest probability of a test whose complement a double still has."""
+NEAR_ONE = 1.0 - 1e-16  # largest probability of a test whose complement a double still has
 
 
 def compute_any_probability(p_value: float, tests: int) -> float:
@@ -110,17 +126,12 @@ def compute_single_level(level: float, tests: int) -> float:
 STEPS, NEWTON = 400, 100
 """Values of tau that are compared, and most steps to the saddlepoint."""
 
+# Largest logarithm of 1 - 2 t, t the saddlepoint of a quantile for a largest weight of 1.
 SLACK = 40.0
-"""Largest logarithm of 1 - 2 t, t the saddlepoint of a quantile for a largest weight of 1."""
-
-MOST_KNOWN = 1e6
-"""Degrees of freedom of a sigma that is exact."""
-
-UNSEEN = 1e-6
-"""Share of the variance by errors below which nothing of them is left."""
-
+MOST_KNOWN = 1e6  # degrees of freedom of a sigma that is exact
+UNSEEN = 1e-6  # share of the variance by errors below which nothing of them is left
+# Sizes of errors, in sigma, that are as probable as each other before the data.
 EVIDENT = (0.1, 30.0)
-"""Sizes of errors, in sigma, that are as probable as each other before the data."""
 
 SMALLEST, LARGEST = 1e-3, 1e4
 """Ends of the values of tau: the strongest element gains this share of sigma, and this many."""

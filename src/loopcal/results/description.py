@@ -17,11 +17,9 @@ import numpy as np
 
 from loopcal.units import SI_SYMBOLS, Dimension
 
+# Second dimension of a matrix over the rows of the main table, such as a covariance.
 OTHER = "other"
-"""Second dimension of a matrix over the rows of the main table, such as a covariance."""
-
-OWN = "*"
-"""Name of a field that stands for all fields of the dataclass in JSON."""
+OWN = "*"  # name of a field that stands for all fields of the dataclass in JSON
 
 Source = str | Callable[[Any], Any]
 """Path of attributes, such as `spectrum.rank`, or a function of the result."""

@@ -15,22 +15,16 @@ from loopcal.plain_text import escape
 from loopcal.results.description import Records
 from loopcal.results.tables import Block, Column, Table, format_number
 
-MOST_ROWS = 30
-"""Rows of a table that a notebook shows."""
-
-MOST_COLUMNS = 16
-"""Columns of a table on a page."""
-
-EXTRA = "tables"
-"""Extra of loopcal that installs pandas and xarray."""
-
+MOST_ROWS = 30  # rows of a table that a notebook shows
+MOST_COLUMNS = 16  # columns of a table on a page
+EXTRA = "tables"  # extra of loopcal that installs pandas and xarray
+# Left for words, right for numbers; colors are those of the notebook.
 STYLE = (
     "<style>.loopcal pre{white-space:pre-wrap;margin:0.3em 0}"
     ".loopcal caption{text-align:left;font-weight:bold}"
     ".loopcal th,.loopcal td{padding:0 0.5em}"
     ".loopcal .words{text-align:left}.loopcal .numbers{text-align:right}</style>"
 )
-"""Left for words, right for numbers; colors are those of the notebook."""
 
 
 def render_html(blocks: Iterable[Block]) -> str:

@@ -17,8 +17,8 @@ Presenter = Callable[..., Any]
 Registered = TypeVar("Registered", bound=Presenter)
 
 _PRESENTERS: dict[tuple[str, str], Presenter] = {}
+# Beginning of a name of presenters -> modules that register them.
 _MODULES: dict[str, list[str]] = {}
-"""Beginning of a name of presenters -> modules that register them."""
 
 
 def name_presenters(**modules: Sequence[str]) -> None:

@@ -18,7 +18,6 @@ from loopcal.results.description import describe_json
 
 INFINITE = "infinite: undetermined by these data, or a division by zero"
 UNDEFINED = "undefined: there is nothing to compute it from"
-
 _PLAIN = frozenset({type(None), bool, int, str})
 
 

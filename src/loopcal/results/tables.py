@@ -18,12 +18,8 @@ from loopcal.plain_text import escape
 from loopcal.results.description import Field, look_up
 from loopcal.units import UNITS, Dimension, Unit
 
-GAP = 2
-"""Blanks between two columns of text."""
-
-NARROWEST = 12
-"""Characters that a column of words keeps when a table is narrowed."""
-
+GAP = 2  # blanks between two columns of text
+NARROWEST = 12  # characters that a column of words keeps when a table is narrowed
 RULE = "─"
 
 Row = TypeVar("Row")
@@ -224,14 +220,10 @@ def _total(widths: Sequence[int]) -> int:
 
 # Numbers for people: digits that the uncertainty leaves.
 
+# A number smaller than this, in whatever unit is shown, is rounding and printed as 0.
 ROUNDING = 1e-12
-"""A number smaller than this, in whatever unit is shown, is rounding and printed as 0."""
-
-INSIGNIFICANT = 0.01
-"""Share of its uncertainty below which a value is printed as 0."""
-
-ABSENT = "-"
-"""Stands for a number that does not exist."""
+INSIGNIFICANT = 0.01  # share of its uncertainty below which a value is printed as 0
+ABSENT = "-"  # stands for a number that does not exist
 
 
 def format_number(value: float, digits: int = 6) -> str:
@@ -290,8 +282,7 @@ def format_uncertainty(uncertainty: float) -> str:
 
 # A page of paragraphs and tables, rendered as text of a given width.
 
-COMMAND = "Next: loopcal "
-"""Start of a line that contains a command."""
+COMMAND = "Next: loopcal "  # start of a line that contains a command
 
 Block = str | Table
 """A paragraph or a table. A paragraph may have several lines; each is wrapped on its own."""

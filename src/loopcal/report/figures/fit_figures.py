@@ -16,7 +16,7 @@ from loopcal.estimate.result import Identification, KindResiduals
 from loopcal.findings.wording import list_names, name_count
 from loopcal.measure.kinds.joints import ActuatorReadings
 from loopcal.mechanism.model import Mechanism
-from loopcal.numerics.distributions import normal_quantile
+from loopcal.numerics.statistics import normal_quantile
 from loopcal.report.figures.style import (
     COLORS,
     DARK,
