@@ -33,6 +33,7 @@ from loopcal.errors import FileError, LoopcalError, suggest_names
 from loopcal.findings import Finding
 from loopcal.output_record import record_outputs
 
+# Heading of the help -> command -> its module, imported when it runs, and what it does.
 SECTIONS = {
     "Describe the robot": {
         "new": ("file", "Write a robot file, and a measurement file, to fill in."),
@@ -90,7 +91,6 @@ SECTIONS = {
         "completion": ("file", "Print the script with which a shell completes commands."),
     },
 }
-"""Heading of the help -> command -> its module, imported when it runs, and what it does."""
 
 
 def find_command(name: str) -> click.Command | None:

@@ -63,8 +63,7 @@ COMMANDS = {
     "help": "show these words",
     "quit": "end, and resume with this command later",
 }
-POLL = 0.5
-"""Seconds between two looks at a followed export."""
+POLL = 0.5  # seconds between two looks at a followed export
 
 
 Row = tuple[str, dict[str, str]]

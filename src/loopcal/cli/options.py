@@ -420,6 +420,7 @@ DECIMAL: Any = option(
     type=click.Choice(("point", "comma")),
 )
 
+# Accept suspicious measurements.
 ALLOWED: Any = Group(
     allow_still=flag("Accept a target that does not move from pose to pose."),
     allow_outside_stroke=flag("Accept readings outside the stroke of their actuator."),
@@ -428,7 +429,6 @@ ALLOWED: Any = Group(
     ),
     allow_duplicates=flag("Accept rows that copy others, up to rounding."),
 )
-"""Accept suspicious measurements."""
 
 
 # What the user stated
@@ -552,7 +552,6 @@ def read_fitted_measurements(
 # Settings of a fit
 
 _FIT = "loopcal.estimate.options:FitOptions"
-
 RANK_TOLERANCE: Any = option(
     "Share of the largest singular value below which one counts as zero.", of=_FIT, type=OPEN_SHARE
 )
@@ -658,7 +657,7 @@ FIT: Any = Group(
 
 SIMULATION = "loopcal.apply.simulated_measurements"
 _INSTRUMENT = f"{SIMULATION}:InstrumentDescription"
-
+# The kind of measurement and its noise, for `make_instrument`.
 INSTRUMENT: Any = Group(
     kinds=option(
         "Kind of measurement: pose, component, position, bearing, ..., or several, such as "
@@ -691,8 +690,8 @@ INSTRUMENT: Any = Group(
         type=_quantity(Dimension.RATIO, is_positive=True),
     ),
 )
-"""The kind of measurement and its noise, for `make_instrument`."""
 
+# The short form of components, and unknown frames and targets, for `make_instrument`.
 UNKNOWN: Any = Group(
     measure=option(
         "Short for --kind component --components NAMES: some of x,y,z,phi,theta,psi. In loopcal "
@@ -709,7 +708,6 @@ UNKNOWN: Any = Group(
         type=NAMES,
     ),
 )
-"""The short form of components, and unknown frames and targets, for `make_instrument`."""
 
 DRAW: Any = option(
     "Number of poses to draw evenly from the workspace, without other poses.",

@@ -26,14 +26,9 @@ if TYPE_CHECKING:
     from loopcal.findings import Finding
     from loopcal.results.tables import Block
 
-WIDEST = 120
-"""Characters of the longest line of prose, on wide terminals."""
-
-LONGEST_MESSAGE = 4000
-"""Characters of a message; a longer one lists more than anybody reads."""
-
-DELAY = 2.0
-"""Seconds of work before progress is shown."""
+WIDEST = 120  # characters of the longest line of prose, on wide terminals
+LONGEST_MESSAGE = 4000  # characters of a message; a longer one lists more than anybody reads
+DELAY = 2.0  # seconds of work before progress is shown
 
 
 def width() -> int:
@@ -142,8 +137,8 @@ def _express(error: UnicodeError) -> tuple[str | bytes, int]:
     return (sign, error.end) if sign else codecs.backslashreplace_errors(error)
 
 
+# Signs of our own texts, where the encoding of a terminal lacks them.
 SIGNS = {"\u2500": "-", "\u2026": "..."}
-"""Signs of our own texts, where the encoding of a terminal lacks them."""
 
 
 def print_message(text: str) -> None:

@@ -269,13 +269,11 @@ def find_swapped_pictures(
     return findings
 
 
+# Probability of an effect of travel by noise, beside effects of the readings, above which travel is
+# not its cause.
 DOUBTED = 0.1
-"""Probability of an effect of travel by noise, beside effects of the readings, above which travel
-is not its cause.
-"""
-
+# Measured values of a pose without which its errors have no pattern, such as single heights.
 FEWEST_VALUES = 2
-"""Measured values of a pose without which its errors have no pattern, such as single heights."""
 
 DRIVES, BACKLASH = "drives", "backlash"
 

@@ -25,14 +25,13 @@ from loopcal.typing import FloatArray, IntArray
 
 PITCH, LENGTH = 6, 7
 """Values of `Slot.axis` beside the axes 0..5 of a twist."""
+# Endings of a limb, with the number of their closure equations.
 ENDINGS = {"rigid": 6, "ball": 3, "distance": 1}
-"""Endings of a limb, with the number of their closure equations."""
 BASE, PLATFORM = -1, 0
 """Numbers of the base and of the platform among the bodies that limbs join; the others follow."""
 CONVERGED, STALLED, EXHAUSTED, NOT_FINITE = 0, 1, 2, 3
 """Values of `State.status`."""
-NEAR_GOAL = 8
-"""The value of `State.status` of a row that comes close to a given goal."""
+NEAR_GOAL = 8  # the value of `State.status` of a row that comes close to a given goal
 
 Task = Callable[[FloatArray, np.ndarray], tuple[FloatArray, FloatArray]]
 """Conditions on the pose: T (N, 3, 4), rows (N,) -> residual (N, c) [m], its slopes (N, c, 6)."""

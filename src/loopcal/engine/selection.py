@@ -38,8 +38,7 @@ from loopcal.version import __version__
 
 # --- Keep freed memory in the process, where the next temporary array finds it.
 
-LARGE = 3_900_000
-"""Length of an array of float64 of 31 MB; glibc adapts its limits up to 32 MB."""
+LARGE = 3_900_000  # length of an array of float64 of 31 MB; glibc adapts its limits up to 32 MB
 
 
 def keep_freed_memory() -> None:

@@ -32,18 +32,14 @@ from loopcal.typing import FloatArray, IntArray
 from loopcal.units import Length
 
 FORMAT = 1
+# Markers of the dictionaries; the smallest that suffices has the most different markers.
 DICTIONARY_SIZES = (50, 100, 250, 1000)
-"""Markers of the dictionaries; the smallest that suffices has the most different markers."""
-MODULES = 7
-"""Rows and columns of a marker: 5 of bits, and a black border."""
-CALIPER = 0.140
-"""Length that a common caliper can measure [m]."""
-CALIPER_SD = 5e-5
-"""Standard deviation of a length that was measured with it from line to line [m]."""
-MOST_SCALE = 0.1
-"""Scale of a print, as a share, beyond which other lines were measured."""
+MODULES = 7  # rows and columns of a marker: 5 of bits, and a black border
+CALIPER = 0.140  # length that a common caliper can measure [m]
+CALIPER_SD = 5e-5  # standard deviation of a length that was measured with it from line to line [m]
+MOST_SCALE = 0.1  # scale of a print, as a share, beyond which other lines were measured
+# Width and height of a sheet [m].
 PAPERS = {"a4": (0.297, 0.210), "a3": (0.420, 0.297), "letter": (0.2794, 0.2159)}
-"""Width and height of a sheet [m]."""
 SIDE, BELOW = 0.020, 0.016
 """Space that the marks need beside and below the squares [m]."""
 
@@ -271,20 +267,15 @@ def format_pdf(shapes: list[Shape], words: list[Words], paper: tuple[float, floa
 
 # Pictures of a printed board.
 
+# Endings of files that are taken for pictures, also of those that cannot be read.
 ENDINGS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".heic", ".heif", ".dng")
-"""Endings of files that are taken for pictures, also of those that cannot be read."""
-LEAST_CORNERS = 8
-"""Corners below which a picture is left out: two more than determine a pose well."""
-BLUR = 3.0
-"""Standard deviation of the blur of edges [px] from which a picture is left out."""
-REDUCED = (2, 4)
-"""Times that a picture is reduced to see whether only blur hides the board."""
-THUMBNAIL = 480
-"""Width of a picture on the contact sheet [px]."""
-FULL_FRAME = 43.2666
-"""Diagonal of the film that focal lengths of phones refer to [mm]."""
+LEAST_CORNERS = 8  # corners below which a picture is left out: two more than determine a pose well
+BLUR = 3.0  # standard deviation of the blur of edges [px] from which a picture is left out
+REDUCED = (2, 4)  # times that a picture is reduced to see whether only blur hides the board
+THUMBNAIL = 480  # width of a picture on the contact sheet [px]
+FULL_FRAME = 43.2666  # diagonal of the film that focal lengths of phones refer to [mm]
+# Difference of focal lengths, as a share, from which a picture is of another zoom.
 SAME_FOCAL = 0.01
-"""Difference of focal lengths, as a share, from which a picture is of another zoom."""
 
 
 @dataclass(frozen=True)

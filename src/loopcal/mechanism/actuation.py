@@ -167,8 +167,7 @@ def differentiate_at_pose(
 # Driven joints l whose sums are given, s(q) = W l, where the sums of readings and of couplings
 # alone do not determine them. Closure determines l with the nodes.
 
-ITERATIONS = 60
-"""Newton steps of a pose; those within reach need fewer than ten."""
+ITERATIONS = 60  # newton steps of a pose; those within reach need fewer than ten
 
 
 def measure_sums(program: Program, weights: FloatArray) -> FloatArray:

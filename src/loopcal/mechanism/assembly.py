@@ -20,8 +20,8 @@ from loopcal.typing import FloatArray
 from loopcal.units import Dimension
 
 AXES = ("rx", "ry", "rz", "x", "y", "z")
+# Axes of a displacement in a link's own frame. `pitch` and `length` can be displaced too.
 TWIST_UNITS = ("rad", "rad", "rad", "m", "m", "m")
-"""Axes of a displacement in a link's own frame. `pitch` and `length` can be displaced too."""
 
 BASE, PLATFORM = "base", "platform"
 """Names of the base, also of a chain of stages, and of the platform."""
@@ -29,8 +29,7 @@ BASE, PLATFORM = "base", "platform"
 MOST_LIMBS, MOST_JOINTS, MOST_ACTUATORS, MOST_PARAMETERS = 100, 50, 200, 2000
 """Largest numbers of limbs, joints of one limb, actuators and parameters."""
 
-MOST_COPIES = 100
-"""Largest number of copies of one limb."""
+MOST_COPIES = 100  # largest number of copies of one limb
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,8 +215,8 @@ class Load:
     at: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
+# Names of the components of a wrench.
 FORCES = tuple(f"{what}.{axis}" for what in ("force", "moment") for axis in "xyz")
-"""Names of the components of a wrench."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,9 +22,9 @@ from loopcal.typing import FloatArray, IntArray
 
 # States of a chain: those of its stages, joined, and the frames of its platforms.
 
+# Statuses of stages, of which the last one in this order is that of the chain. Any other status,
+# such as that of another mode, is less severe than an open loop.
 SEVERITY = (CONVERGED, EXHAUSTED, STALLED, NOT_FINITE)
-"""Statuses of stages, of which the last one in this order is that of the chain. Any other status,
-such as that of another mode, is less severe than an open loop."""
 
 
 @dataclass(frozen=True, eq=False)

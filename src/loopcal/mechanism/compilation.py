@@ -107,12 +107,10 @@ def _find_single_values(robot: Mechanism, values: FloatArray) -> Iterator[tuple[
         yield p.name, report_finding(code, name=p.name, **shown)
 
 
-STARTS = 4
-"""Disturbed starts from which home is tried where it is not found."""
+STARTS = 4  # disturbed starts from which home is tried where it is not found
+# Characteristic length [m] of a mechanism whose lengths are all zero (a spherical one).
 DEFAULT_SIZE = 1.0
-"""Characteristic length [m] of a mechanism whose lengths are all zero (a spherical one)."""
-POINT = 1e-9
-"""Ratio of size and longest link below which all limbs begin and end in one point."""
+POINT = 1e-9  # ratio of size and longest link below which all limbs begin and end in one point
 
 
 def build(

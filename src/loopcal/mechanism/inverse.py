@@ -52,8 +52,7 @@ from loopcal.numerics.gauss_newton import ROUNDING as ROUNDED
 from loopcal.numerics.trial_batch import TrialBatch, map_arrays
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
-ITERATIONS = 60
-"""Newton steps of an inverse solution, each at most half of the robot's size."""
+ITERATIONS = 60  # newton steps of an inverse solution, each at most half of the robot's size
 ANGLES = {"rx": "roll", "ry": "pitch", "rz": "yaw"}
 
 
@@ -158,8 +157,7 @@ def moves_by_drives(robot: Mechanism) -> bool:
 
 # A sphere that the platform cannot leave, from the lengths of the links.
 
-ROUNDING = 1e-9
-"""Excess, relative to the robot's size, of a target at the bound itself."""
+ROUNDING = 1e-9  # excess, relative to the robot's size, of a target at the bound itself
 
 
 def bound_platform(robot: Mechanism, values: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -206,32 +204,29 @@ def _bound_by_limbs(robot: Mechanism, values: FloatArray) -> tuple[FloatArray, F
 
 # Inverse kinematics by the forward one: Newton's method on the driven joints, c(T(u)) = c*.
 
-STEPS = 60
-"""Newton steps of a row."""
+STEPS = 60  # newton steps of a row
 CLOSE, CLOSE_ON_PATH = 1e-12, 1e-4
 """Distance from the target coordinates, relative to the robot's size, of a solved row, and of one
 that only begins the next step of its path.
 
 A forward solution is known to 1e-13 of the size.
 """
-LONGEST_STEP = 0.5
-"""Longest step of a joint: in radians, or relative to the robot's size."""
+LONGEST_STEP = 0.5  # longest step of a joint: in radians, or relative to the robot's size
+# Share of a step that must bring a row closer to its target; below it the target is not reachable
+# from here.
 SHORTEST_SHARE = 1e-3
-"""Share of a step that must bring a row closer to its target; below it the target is not
-reachable from here."""
 PROGRESS, PROGRESS_STEPS, PROGRESS_ON_PATH = 0.5, 10, 5
 """Share of its distance from the target that a row must lose in so many steps, else it has stalled;
 fewer on a path, whose targets are near.
 
 In ten steps the longest ones turn a joint by 5 rad. Steps close to a stretched arm gain less.
 """
+# Share of its distance from the target that a projected row must be able to lose, to first order,
+# beside `CLOSE`, to go on.
 SHORT_SHARE = 1e-8
-"""Share of its distance from the target that a projected row must be able to lose, to first order,
-beside `CLOSE`, to go on."""
+# Relative singular value below which a combination of drives does not move the platform.
 DEPENDENT = 1e-9
-"""Relative singular value below which a combination of drives does not move the platform."""
-PATH_STEPS = 8
-"""Steps of the path from the start's pose to a target."""
+PATH_STEPS = 8  # steps of the path from the start's pose to a target
 
 
 @dataclass(frozen=True, eq=False)
@@ -614,11 +609,10 @@ def _follow_path(rows: _Rows, start: _Iterate) -> _Iterate:
 
 # The reachable pose nearest to one that takes more freedoms than the robot has.
 
+# A pose is the nearest one where a step changes the distance by at most this share to first order,
+# or by this share of `REACHED`, where the target itself is reachable.
 STATIONARY = 1e-6
-"""A pose is the nearest one where a step changes the distance by at most this share to first order,
-or by this share of `REACHED`, where the target itself is reachable."""
-REACHED = 1e-3
-"""Distance below which a target counts as reachable, relative to the robot's size."""
+REACHED = 1e-3  # distance below which a target counts as reachable, relative to the robot's size
 
 
 def find_nearest_reachable(

@@ -43,10 +43,9 @@ from loopcal.typing import BoolArray, FloatArray
 
 # Loops closed at joint values or their sums, and along straight paths of these from a start.
 
+# Steps of the path from the start's readings, tried in turn where the direct solution fails.
 PATH_STEPS = (8, 64)
-"""Steps of the path from the start's readings, tried in turn where the direct solution fails."""
-PART = 4096
-"""Poses of paths that are solved together."""
+PART = 4096  # poses of paths that are solved together
 WIDE = 1e-2
 """Gap, relative to the robot's size, that the errors of redundant readings do not explain.
 

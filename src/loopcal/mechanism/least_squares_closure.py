@@ -30,17 +30,15 @@ from loopcal.mechanism.limb_rows import divide_limbs, expand_map, follow_limb, m
 from loopcal.mechanism.states import make_start
 from loopcal.typing import FloatArray, IntArray
 
-CHUNK = 512
-"""Rows differentiated together."""
+CHUNK = 512  # rows differentiated together
 CHANGE = 1e-5
 """Change of an angle [rad], or of a length relative to the robot's size, of a central difference.
 
 Its error is about the square of the change, and the rounding of 1e-16 over the change.
 """
-CLOSED = 1e-12
-"""Gap of the loops, relative to the robot's size, below which its terms are rounding."""
+CLOSED = 1e-12  # gap of the loops, relative to the robot's size, below which its terms are rounding
+# Smallest diagonal of R, relative to its largest one, of a pose that has derivatives.
 SINGULAR = 1e-13
-"""Smallest diagonal of R, relative to its largest one, of a pose that has derivatives."""
 
 
 class _Rows(NamedTuple):

@@ -19,8 +19,7 @@ from loopcal.mechanism.states import driven_values
 from loopcal.numerics.trial_batch import map_arrays
 from loopcal.typing import FloatArray, IntArray
 
-BLOCK_ROWS = 1024
-"""Rows linearized together."""
+BLOCK_ROWS = 1024  # rows linearized together
 
 
 def name_passive_joints(robot: Mechanism) -> tuple[str, ...]:

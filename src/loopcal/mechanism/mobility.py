@@ -51,14 +51,12 @@ RANK = 1e-9
 
 Real margins are above 1e-4, rounding is below 1e-13.
 """
-CLOSED = 1e-9
-"""Gap of the loops, as a share of the robot's size, below which they are closed."""
+CLOSED = 1e-9  # gap of the loops, as a share of the robot's size, below which they are closed
+# Motion of a loop's closure by an actuator, as a share of the robot's size or per unit of stroke,
+# below which the actuator does not move it. An iteration ends this far from a singular position.
 STRETCHED = 1e-5
-"""Motion of a loop's closure by an actuator, as a share of the robot's size or per unit of stroke,
-below which the actuator does not move it. An iteration ends this far from a singular position.
-"""
+# Components below this share of the largest one are left out of the description of a motion.
 MAIN_SHARE = 0.3
-"""Components below this share of the largest one are left out of the description of a motion."""
 
 
 def check_mobility(robot: Mechanism) -> None:

@@ -104,8 +104,7 @@ class ParameterUnits:
         return (self.slots.matrix[slot, column] * unit)[None]
 
 
-SHOWN_ACTUATORS = 8
-"""Actuators that `repr` names before it counts the others."""
+SHOWN_ACTUATORS = 8  # actuators that `repr` names before it counts the others
 
 
 @dataclass(frozen=True, eq=False)

@@ -30,12 +30,11 @@ from loopcal.results.result import Result
 from loopcal.typing import FloatArray, IntArray
 from loopcal.units import Dimension
 
-BATCH = 2048
-"""Starts solved together."""
+BATCH = 2048  # starts solved together
+# Largest difference of equal solutions: lengths relative to the robot's size, angles in rad.
 SAME = 1e-6
-"""Largest difference of equal solutions: lengths relative to the robot's size, angles in rad."""
+# Range of the distance of starting positions from the middle of the base points, per size.
 SCALES = (0.1, 1.0)
-"""Range of the distance of starting positions from the middle of the base points, per size."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -36,10 +36,9 @@ from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.states import Status, join_states, select_poses
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
+# Largest component, relative to the whole, by which a vector may differ from a named direction, or
+# from the equations of other limbs, and still count as one of them.
 SAME = 1e-6
-"""Largest component, relative to the whole, by which a vector may differ from a named direction,
-or from the equations of other limbs, and still count as one of them.
-"""
 BREAKS = 1e-7
 """Share of a parameter's effect on the equations above which it opens the loops.
 

@@ -41,10 +41,9 @@ from loopcal.results.result import Result
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension
 
+# Share of the median margin below which a pose is close to a singularity (rule of thumb).
 NEAR_SHARE = 0.1
-"""Share of the median margin below which a pose is close to a singularity (rule of thumb)."""
-SAMPLE_SIZE = 400
-"""Positions of the workspace from which the median margins are taken."""
+SAMPLE_SIZE = 400  # positions of the workspace from which the median margins are taken
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -52,19 +52,17 @@ from loopcal.results.result import TableResult
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import SI_SYMBOLS
 
+# Number of Newton steps -> largest distance that they leave, per distance of the start.
 CONTRACTION = {1: 1 / 2, 3: 1 / 8}
-"""Number of Newton steps -> largest distance that they leave, per distance of the start."""
 FIRST_STEP, GROWTH, SHORTEST = 0.25, 2.0, 1 / 500
 """First step of a path as a share of it, its growth after a safe step, and the shortest step.
 
 A step that is not safe is divided by the square of the growth.
 """
-TRIALS = 80
-"""Most steps of a path, safe or not."""
-ITERATIONS = 12
-"""Newton steps of a step of a path: a safe one needs fewer."""
+TRIALS = 80  # most steps of a path, safe or not
+ITERATIONS = 12  # newton steps of a step of a path: a safe one needs fewer
+# Largest difference of equal joints and poses: lengths per size of the robot, angles [rad].
 SAME_JOINTS = 1e-6
-"""Largest difference of equal joints and poses: lengths per size of the robot, angles [rad]."""
 
 Step = Callable[[IntArray, FloatArray, State], State]
 """Returns states (1, j) at shares (j,) of the paths of rows (j,), from states on these paths."""
@@ -167,8 +165,7 @@ SAME_POSE = 1e-7
 
 Rounding grows close to a singularity, up to the square root of the machine precision.
 """
-STEPS = 4
-"""Steps of the path from the start's pose to a target."""
+STEPS = 4  # steps of the path from the start's pose to a target
 
 Solver = Callable[[FloatArray, State | None], tuple[State, BoolArray | None]]
 """Solves inverse kinematics for targets (n, ..) from a start: states (1, n), and where the engine
@@ -351,10 +348,10 @@ def _follow_poses(robot: Mechanism, first: State, goal: State) -> tuple[State, I
     return current, alive
 
 
+# Residual [m] of a converged row above which its redundant readings contradict each other.
 COMPROMISE = 1e-9
-"""Residual [m] of a converged row above which its redundant readings contradict each other."""
+# Largest deviation of R'R from the identity: the rounding of a file with seven digits.
 ROTATION = 1e-6
-"""Largest deviation of R'R from the identity: the rounding of a file with seven digits."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -42,9 +42,9 @@ from loopcal.typing import BoolArray, FloatArray, IntArray
 
 # Sums of joint values: s = W joints, with a weight for each reading and driven joint.
 
+# Ratio of singular values of weights, each row divided by its largest weight, below which they are
+# singular.
 SINGULAR = 1e-9
-"""Ratio of singular values of weights, each row divided by its largest weight, below which they are
-singular."""
 
 
 def apply_weights(weights: FloatArray, values: FloatArray) -> FloatArray:
@@ -76,14 +76,13 @@ def count_independent(weights: FloatArray) -> int:
 
 # Triangle drives: a linear actuator that turns a revolute joint through two anchor points.
 
+# Terms of a triangle, (.., 10). `side` is +1 or -1, the sign of sin(theta - gamma), and `middle`
+# the nominal angle between the dead points; no parameter changes these two.
 TRIANGLE_TERMS = (
     *("foot.x", "foot.y", "foot.z", "head.x", "head.y", "head.z", "skew.x", "skew.y"),
     *("side", "middle"),
 )
-"""Terms of a triangle, (.., 10). `side` is +1 or -1, the sign of sin(theta - gamma), and `middle`
-the nominal angle between the dead points; no parameter changes these two."""
-MOVABLE = 8
-"""Number of the terms that parameters can change."""
+MOVABLE = 8  # number of the terms that parameters can change
 
 
 def compute_angle(length: FloatArray, triangle: FloatArray) -> FloatArray:
@@ -206,15 +205,13 @@ drive, that of its length.
 """
 TERMS = tuple(SHAPES)
 HARMONICS = ("sin1", "cos1", "sin2", "cos2")
+# Terms of a robot with triangle drives, in the order of the last axis of tau (t, a, 19).
 ALL_TERMS = (*TERMS, *TRIANGLE_TERMS)
-"""Terms of a robot with triangle drives, in the order of the last axis of tau (t, a, 19)."""
 SIDE, COMPLIANCE = ALL_TERMS.index("side"), ALL_TERMS.index("compliance")
-TABLE = "table"
-"""What the name of the term of a table begins with; the number of its point follows."""
+TABLE = "table"  # what the name of the term of a table begins with; the number of its point follows
+# What the name of the term of a weight begins with; the name of a driven joint follows.
 WEIGHT = "weight."
-"""What the name of the term of a weight begins with; the name of a driven joint follows."""
-LOAD = "load."
-"""What the name of the load of a drive begins with; the name of the drive follows."""
+LOAD = "load."  # what the name of the load of a drive begins with; the name of the drive follows
 SOURCE, REFERENCE, LOADED, FIXED = 2, 3, 4, 5
 """Constants of a row before the points of its table: frequency, whether it is cubic, the number of
 its reading, -1 for none, the reference of that reading, NaN where it is commanded, and the number

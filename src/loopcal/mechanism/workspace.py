@@ -23,10 +23,9 @@ from loopcal.results.result import Result
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import Dimension
 
-MIN_DRAWS = 2000
-"""Positions drawn before a workspace is refused."""
+MIN_DRAWS = 2000  # positions drawn before a workspace is refused
+# Share of them that must be reachable: drawing n positions tries at most 100 n.
 MIN_REACHABLE_SHARE = 1e-2
-"""Share of them that must be reachable: drawing n positions tries at most 100 n."""
 
 
 class Limit(NamedTuple):
@@ -208,8 +207,8 @@ def measure_reachable_share(robot: Mechanism, n: int, seed: int = 0) -> Reachabl
     return ReachableShare(k / n, float(low), float(high), n, dict((+rejected).most_common()))
 
 
+# Tilts of rings of poses, as shares of the largest one; the tilts between them stay for checks.
 RING_SHARES = (2 / 7, 4 / 7, 6 / 7)
-"""Tilts of rings of poses, as shares of the largest one; the tilts between them stay for checks."""
 
 
 def list_tilt_rings(robot: Mechanism, n: int) -> FloatArray:

@@ -31,10 +31,8 @@ if TYPE_CHECKING:
     from loopcal.papers.published import Reproduction
     from loopcal.studies.specification import ErrorsLevel, Study
 
-STUDY = "study.yaml"
-"""File of the study of a paper."""
-TRIALS = 50
-"""Drawings of noise behind each statistical number, unless more are asked for."""
+STUDY = "study.yaml"  # file of the study of a paper
+TRIALS = 50  # drawings of noise behind each statistical number, unless more are asked for
 
 
 @dataclass(frozen=True)

@@ -54,8 +54,8 @@ if TYPE_CHECKING:
 Cell = str | float | int | bool | None
 Row = dict[str, Any]
 """A row of a table: its cells by name, in the order of the columns."""
+# Of a unit, by which a difference may exceed it: decimal numbers are no binary ones.
 ROUNDING = 1e-9
-"""Of a unit, by which a difference may exceed it: decimal numbers are no binary ones."""
 
 
 @dataclass(frozen=True)
@@ -221,8 +221,8 @@ def _read_file(module: str, name: str) -> dict[str, Any]:
     return read_yaml(Path(module).with_name(name), "file of a paper", has_names=False).content
 
 
+# Place of a claim that the paper does not make.
 OWN_CHECK = "our own check, not a statement of the paper"
-"""Place of a claim that the paper does not make."""
 
 
 @dataclass(frozen=True)
@@ -405,8 +405,7 @@ FOLDER = FolderKind(
 )
 
 
-APART = 0.04
-"""Least distance of the markers of a line, as a share of the diagonal of the axes."""
+APART = 0.04  # least distance of the markers of a line, as a share of the diagonal of the axes
 
 
 class Content(NamedTuple):

@@ -32,7 +32,6 @@ from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import Dimension
 
 ROUNDING = 1e-12  # share of a bound by which it may be exceeded: the rounding of its own number
-
 HALF_TURN = Limit(
     lambda value: 0.0 < value <= np.pi,
     "an angle above 0, at most 180 deg",
@@ -332,8 +331,8 @@ class PlanOptions(PlanSettings):
         return {name: getattr(self, name) for name in ASKED}
 
 
+# Options that a session of measuring the plan needs.
 ASKED = ("target", "goal", "share", "frame", "constraints")
-"""Options that a session of measuring the plan needs."""
 
 
 def restore_options(asked: Mapping[str, Any]) -> PlanOptions:

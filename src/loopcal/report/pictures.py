@@ -18,24 +18,16 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 FORMATS = (".png", ".svg", ".pdf")
-DPI = 150
-"""Resolution of a PNG picture."""
-
-POINTS = 72
-"""Units of an inch in an SVG picture."""
-
-PLACES = 4
-"""Decimals of the position of axes, as a share of the figure."""
-
-SALT = "loopcal"
-"""Identifiers in an SVG are random without a salt."""
-
+DPI = 150  # resolution of a PNG picture
+POINTS = 72  # units of an inch in an SVG picture
+PLACES = 4  # decimals of the position of axes, as a share of the figure
+SALT = "loopcal"  # identifiers in an SVG are random without a salt
+# The time of writing, which is left out, by format.
 METADATA: dict[str, dict[str, None]] = {
     ".png": {},
     ".svg": {"Date": None},
     ".pdf": {"CreationDate": None},
 }
-"""The time of writing, which is left out, by format."""
 
 
 @contextmanager
@@ -96,12 +88,10 @@ def save_figure(path: Path, figure: Figure, *, write: Callable[[Path, bytes], ob
 # Figures of matplotlib as SVG elements inside of HTML, under a strict content security policy.
 
 SHAPES = ("path", "rect", "circle", "line", "polyline", "polygon", "text", "tspan", "image")
+# Elements that draw.
 DRAWING = frozenset((*SHAPES, "svg", "g", "defs", "use", "clipPath", "linearGradient", "stop"))
-"""Elements that draw."""
-
+# Fonts of all texts; a browser takes the first that it has.
 FAMILY = "DejaVu Sans, Verdana, Arial, sans-serif"
-"""Fonts of all texts; a browser takes the first that it has."""
-
 _FONT = re.compile(r"([a-z0-9 ]*?)\s*([0-9.]+)px(?:\s.*)?")
 _REFERENCE = re.compile(r"url\(#([^)]+)\)")
 _DIGITS = re.compile(r"-?\d+\.\d{3,}")

@@ -31,11 +31,8 @@ if TYPE_CHECKING:
     from loopcal.mechanism.assembly import Address
     from loopcal.mechanism.model import Mechanism
 
-DIGITS = 9
-"""Significant digits of nominal values."""
-
-RESOLUTION = 1e-5
-"""Share of the stroke to which a reading at home is shown."""
+DIGITS = 9  # significant digits of nominal values
+RESOLUTION = 1e-5  # share of the stroke to which a reading at home is shown
 
 
 def view_robot(inspection: RobotInspection) -> list[Block]:

@@ -44,14 +44,10 @@ if TYPE_CHECKING:
     )
     from loopcal.mechanism.model import Mechanism
 
+# Beginning of the codes of statements on limits, which follow the tables.
 CONFORMITY = "conformity."
-"""Beginning of the codes of statements on limits, which follow the tables."""
-
-NOTICEABLE = 0.01
-"""Share of the error after calibration above which such a difference is stated."""
-
-SIMILAR = 5e-3
-"""Relative difference up to which two errors are called equal."""
+NOTICEABLE = 0.01  # share of the error after calibration above which such a difference is stated
+SIMILAR = 5e-3  # relative difference up to which two errors are called equal
 
 
 def list_findings(findings: Sequence[Finding]) -> list[str]:
@@ -365,14 +361,10 @@ def tabulate_comparison(comparison: RunComparison) -> Table:
 
 # Regularization curves as tables.
 
+# Name of a curve -> the method in words, and its number.
 WORDS = {"lam": ("Ridge", "lam"), "k": ("Truncated SVD", "k")}
-"""Name of a curve -> the method in words, and its number."""
-
-SCORES = (Column("held-out error"), Column("standard error"))
-"""Columns of a score."""
-
-ROWS = 9
-"""Values of a curve that the table contains beside those that rules choose."""
+SCORES = (Column("held-out error"), Column("standard error"))  # columns of a score
+ROWS = 9  # values of a curve that the table contains beside those that rules choose
 
 
 @register("page", "loopcal.diagnose.cross_validation:RegularizationCurves")

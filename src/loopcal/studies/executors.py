@@ -18,8 +18,8 @@ from loopcal.environment import import_optional, pin_processes
 from loopcal.errors import StudyError
 from loopcal.findings import report_finding
 
+# Workers that one task may stop. After that it is given up, because it stops any worker.
 MOST_LOSSES = 5
-"""Workers that one task may stop. After that it is given up, because it stops any worker."""
 
 
 class Task(Protocol):
@@ -249,14 +249,11 @@ def _without_interrupts() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
+# Tasks in flight for each thread of a cluster: one is computed, the next one waits there.
 QUEUED = 2
-"""Tasks in flight for each thread of a cluster: one is computed, the next one waits there."""
 
-PATIENCE = 60.0
-"""Seconds to wait for the scheduler, and for the first worker."""
-
-PERIOD = 1.0
-"""Seconds after which workers are counted again, and look for their driver."""
+PATIENCE = 60.0  # seconds to wait for the scheduler, and for the first worker
+PERIOD = 1.0  # seconds after which workers are counted again, and look for their driver
 
 
 @dataclass(frozen=True)

@@ -49,15 +49,12 @@ from loopcal.studies.specification import FACTORS, PER_LEG, Cell, Study, compute
 from loopcal.studies.study_result import StudyResult, explain_failures
 from loopcal.typing import Progress, report_no_progress
 
-MOST_WAITING = 64
-"""Cells whose poses are asked for while the first of them waits for its own."""
+MOST_WAITING = 64  # cells whose poses are asked for while the first of them waits for its own
 
 
-MOST_NAMED = 5
-"""Blocks that were given up and are named in a finding."""
-
+MOST_NAMED = 5  # blocks that were given up and are named in a finding
+# Blocks whose keys are read at once, so that memory does not grow with the number of blocks.
 LISTED = 200
-"""Blocks whose keys are read at once, so that memory does not grow with the number of blocks."""
 
 
 @dataclass(frozen=True)
@@ -127,8 +124,7 @@ class RunReport:
         return tuple(findings)
 
 
-WHOLE = Share()
-"""All blocks."""
+WHOLE = Share()  # all blocks
 
 
 def run_blocks(
@@ -232,11 +228,8 @@ def list_missing_tasks(
                         yield make_block_task(cell.number, of_block, known)
 
 
-MOST_BLOCKS = 4
-"""Cells of which a block is computed at most; further cells are estimated from them."""
-
-LONGEST = 30.0
-"""Seconds after which no further block is begun."""
+MOST_BLOCKS = 4  # cells of which a block is computed at most; further cells are estimated from them
+LONGEST = 30.0  # seconds after which no further block is begun
 
 
 @dataclass(frozen=True)
@@ -405,8 +398,8 @@ def run_study(
 ROBOT, TRUTH, DATA = "robot.yaml", "truth.yaml", "measurements.csv"
 """Files of the folder of inputs: the nominal robot, the true machine, and what was measured."""
 
+# The folder of inputs; its document says which trial it is.
 INPUTS = FolderKind("trial", "trial.json", ("study", "cell", "trial"), (ROBOT, TRUTH, DATA))
-"""The folder of inputs; its document says which trial it is."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -32,6 +32,7 @@ from loopcal.measure.instrument import SIGMA, Distribution
 from loopcal.results.result import Result
 from loopcal.units import SI_SYMBOLS, Angle, Dimension, Length, find_unit, parse_quantity
 
+# Key of a factor in a study file -> its name in cells and tables.
 FACTORS: Mapping[str, str] = {
     "robots": "robot",
     "instruments": "instrument",
@@ -41,13 +42,9 @@ FACTORS: Mapping[str, str] = {
     "methods": "method",
     "effects": "effects",
 }
-"""Key of a factor in a study file -> its name in cells and tables."""
 
-PER_LEG = "per-leg"
-"""Method of a level beside those of `loopcal.estimate.methods`."""
-
-FEWEST_POINTS = 4
-"""Smallest number of points of a plane with its line."""
+PER_LEG = "per-leg"  # method of a level beside those of `loopcal.estimate.methods`
+FEWEST_POINTS = 4  # smallest number of points of a plane with its line
 
 
 @dataclass(frozen=True)
@@ -537,8 +534,7 @@ def list_columns(scores: Scores) -> tuple[ScoreColumn, ...]:
     return (*columns["every"], *verdict, *(columns["base"] if scores.frame == "both" else ()))
 
 
-MORE_IS_BETTER = ("covered_", "rank")
-"""Beginning of the names of scores that have no upper limit."""
+MORE_IS_BETTER = ("covered_", "rank")  # beginning of the names of scores that have no upper limit
 
 
 def check_question(study: Study, question: Question) -> float:
@@ -659,8 +655,7 @@ BLOCK, REPLICATES = 50, 1000
 """Trials of a block, and of a cell, by default."""
 
 
-MOST_TRIALS = 2000
-"""Largest number of trials of a block."""
+MOST_TRIALS = 2000  # largest number of trials of a block
 
 
 @dataclass(frozen=True)
@@ -763,14 +758,10 @@ class Study(StudySettings, Result):
         return msgspec.json.decode(text, type=cls)
 
 
-FREE = frozenset({"title", "order", "questions"})
-"""Keys that change no number."""
-
+FREE = frozenset({"title", "order", "questions"})  # keys that change no number
+# Factor -> setting that says where a level was read.
 NAMES_OF_FILES = {"robots": "source", "poses": "file"}
-"""Factor -> setting that says where a level was read."""
-
-LONGEST = 40
-"""Characters of a value that is shown."""
+LONGEST = 40  # characters of a value that is shown
 
 
 def list_conflicts(old: str, new: str) -> tuple[str, ...]:

@@ -247,20 +247,11 @@ def read_trials(
     return numbers[:done], scores[:done]
 
 
-LEVEL = 0.95
-"""Of all intervals."""
-
-HIGH = 0.95
-"""The quantile beside the median: 95 % of the machines are better."""
-
-BEFORE = "_before"
-"""Part of the names of scores before calibration, which failed trials have, too."""
-
-SHARE = "covered_"
-"""Beginning of the names of scores that are shares; they have no quantiles."""
-
-MEMORY = 2**26
-"""Bytes of scores that are held at once."""
+LEVEL = 0.95  # of all intervals
+HIGH = 0.95  # the quantile beside the median: 95 % of the machines are better
+BEFORE = "_before"  # part of the names of scores before calibration, which failed trials have, too
+SHARE = "covered_"  # beginning of the names of scores that are shares; they have no quantiles
+MEMORY = 2**26  # bytes of scores that are held at once
 
 
 @dataclass(frozen=True)
@@ -735,8 +726,8 @@ def _count_reached(
     return (0, 0) if counted and not defined else (reached, trials)
 
 
+# SI symbol of a score -> unit of its limit on the screen.
 SHOWN_UNITS = {"m": "um", "rad": "urad", "1": ""}
-"""SI symbol of a score -> unit of its limit on the screen."""
 
 
 def view_answers(answered: Sequence[AnsweredQuestion]) -> list[Block]:
@@ -801,12 +792,10 @@ JSON, CSV = "summary.json", "summary.csv"
 """Files of a summary in the folder of its study."""
 
 NO_FIGURES: Mapping[str, bytes] = {}
-
+# Scores of the table on the screen by default.
 SHOWN = ("position", "orientation", "position_base", "covered_parameters")
-"""Scores of the table on the screen by default."""
-
+# SI symbol -> unit on the screen.
 UNITS = {"m": find_unit("mm"), "rad": find_unit("mrad"), "1": find_unit("1")}
-"""SI symbol -> unit on the screen."""
 
 
 def list_shown(study: Study, summary: StudySummary, names: Sequence[str] = ()) -> tuple[str, ...]:

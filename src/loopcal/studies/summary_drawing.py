@@ -41,31 +41,22 @@ from loopcal.units import Unit
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+# Stands for a factor: the words in which levels along the axis differ, beside their number.
 CHAIN = ""
-"""Stands for a factor: the words in which levels along the axis differ, beside their number."""
-
-LETTERS = 60
-"""Letters that fit below a panel, side by side."""
-
-MOST_PANELS = 12
-"""Largest number of panels of a figure."""
-
+LETTERS = 60  # letters that fit below a panel, side by side
+MOST_PANELS = 12  # largest number of panels of a figure
+# Statistic -> marker and line, and its words.
 STYLES = {"median": ("o-", "median"), "high": ("^:", "95 % of machines"), "mean": ("o-", "mean")}
-"""Statistic -> marker and line, and its words."""
 
 OFFSET, SPREAD = 0.16, 0.6
 """Shift between two colors at levels without numbers, and that of all of them at most, in steps
 between levels.
 """
 
-COVERAGE = 0.95
-"""What shares of coverage should be."""
-
-WIDE = 5.0
-"""Ratio of the ends of an axis from which it is logarithmic."""
-
+COVERAGE = 0.95  # what shares of coverage should be
+WIDE = 5.0  # ratio of the ends of an axis from which it is logarithmic
+# Beginning of the names of scores that a frame of errors belongs to.
 IN_FRAME = ("position", "orientation", "covered_position", "covered_orientation")
-"""Beginning of the names of scores that a frame of errors belongs to."""
 
 
 @dataclass(frozen=True)

@@ -584,11 +584,8 @@ def regularize(
     return Output(document, lambda: [*view_regularization(curves), "", written])
 
 
-MOST_DIGITS = 10
-"""Digits of a number of poses; a longer text is no unit of resampling."""
-
+MOST_DIGITS = 10  # digits of a number of poses; a longer text is no unit of resampling
 BOOTSTRAP = "loopcal.diagnose.bootstrap"
-
 SOURCE: Any = opt.argument("RUN|ROBOT")
 LEVEL: Any = opt.option(
     "Coverage of the intervals.", of=f"{BOOTSTRAP}:Bootstrap.intervals", type=opt.OPEN_SHARE

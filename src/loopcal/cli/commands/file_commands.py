@@ -23,13 +23,13 @@ from loopcal.units import Dimension, find_unit, list_symbols
 if TYPE_CHECKING:
     from loopcal.results.tables import Block
 
+# Kind of file -> what makes its JSON Schema.
 SCHEMAS = {
     "robot": "loopcal.io.file_schemas:build_robot_schema",
     "settings": "loopcal.io.file_schemas:build_settings_schema",
     "profile": "loopcal.io.file_schemas:build_profile_schema",
     "study": "loopcal.studies.files.study_file:build_study_schema",
 }
-"""Kind of file -> what makes its JSON Schema."""
 
 
 @opt.command()
@@ -253,8 +253,7 @@ def completion(shell: str = opt.argument(type=click.Choice(("bash", "zsh", "fish
     return Output({"shell": shell, "script": text}, lambda: text)
 
 
-SHOWN = 20
-"""Lines that do not match a profile that are listed."""
+SHOWN = 20  # lines that do not match a profile that are listed
 
 
 @opt.command()
@@ -455,6 +454,7 @@ def _sigma(what: str, default: str) -> Any:
     return _setting(f"Noise of {what}.  [default: {default}]", type=opt.POSITIVE_LENGTH)
 
 
+# How FILE is read.
 SETTINGS: Any = opt.Group(
     sigma_height=_sigma("the probe {sigma_height}", "{height}"),
     sigma_distance=_sigma("distances {sigma_distance}", "{distance}"),
@@ -477,7 +477,6 @@ SETTINGS: Any = opt.Group(
         "Link that is the platform {platform}. Default: the one on a fixed joint.", metavar="LINK"
     ),
 )
-"""How FILE is read."""
 
 
 @opt.command("import")

@@ -241,18 +241,16 @@ def _fill_in(
     return fill_in_measurements(robot, planned, instrument, **how)
 
 
+# Word of --measure for points on planes and lines that a coordinate measuring machine holds.
 PLANE_LINE = "plane-line"
-"""Word of --measure for points on planes and lines that a coordinate measuring machine holds."""
-
 OPTIONS = "loopcal.planning.constraints:PlanOptions"
 POSES = "loopcal.planning.constraints:N_POSES"
-CHECK_POSES = 5
-"""Poses of a check by default."""
+CHECK_POSES = 5  # poses of a check by default
 SURFACES = "loopcal.planning.plane_line_planning:SurfaceOptions"
-
 _COUNTED = "whose size is --groups and --points"
 _HELD = "because a measuring machine holds x, y or z to --sigma-position"
 _CHOSEN = "which moves points within the workspace and chooses by criterion D"
+# Options that have no effect with --measure plane-line, and why.
 EXCLUDED_BY_PLANE_LINE = {
     **dict.fromkeys(("poses", "accuracy", "curve"), _COUNTED),
     **dict.fromkeys(("like", "kinds", "components", "orientation", "sigma_angle"), _HELD),
@@ -264,7 +262,6 @@ EXCLUDED_BY_PLANE_LINE = {
     "unknown_frames": "whose surfaces are unknown in every group",
     "targets": "which checks the tool",
 }
-"""Options that have no effect with --measure plane-line, and why."""
 
 
 @opt.command()

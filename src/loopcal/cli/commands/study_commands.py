@@ -419,8 +419,7 @@ def replay(
 
 
 RUN = "loopcal.papers.paper:Paper.run"
-HEADING = 18
-"""Characters of a line of a heading."""
+HEADING = 18  # characters of a line of a heading
 
 
 @opt.command()

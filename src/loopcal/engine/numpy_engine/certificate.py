@@ -25,13 +25,13 @@ from loopcal.engine.numpy_engine.closure import (
 from loopcal.engine.program import Program, State
 from loopcal.typing import BoolArray, FloatArray
 
+# Largest product of the distance from the goal and the change of the Jacobian; proven: 2/3.
 CONTRACTION = 0.6
-"""Largest product of the distance from the goal and the change of the Jacobian; proven: 2/3."""
+# An angle is below 0.75 times the norm of the difference of the rotations, if this is below 1.
 ANGLE = 0.75
-"""An angle is below 0.75 times the norm of the difference of the rotations, if this is below 1."""
 SQRT2 = float(np.sqrt(2.0))
+# Share of the first residual that may be left after the first step; step control allows 0.9999.
 DECREASE = 0.99
-"""Share of the first residual that may be left after the first step; step control allows 0.9999."""
 
 
 def has_driven_rods(program: Program) -> bool:

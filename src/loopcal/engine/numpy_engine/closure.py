@@ -28,8 +28,8 @@ from loopcal.engine.program import (
 )
 from loopcal.typing import FloatArray
 
+# Rows computed together: few enough for the cache, and enough that Python costs little.
 CHUNK = 5120
-"""Rows computed together: few enough for the cache, and enough that Python costs little."""
 
 
 def linearize(

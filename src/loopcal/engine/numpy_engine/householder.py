@@ -12,10 +12,9 @@ import numpy as np
 
 from loopcal.typing import FloatArray
 
+# Least divisor: far below every square of a length that matters, and without infinities.
 SMALLEST = 1e-300
-"""Least divisor: far below every square of a length that matters, and without infinities."""
-PART = 8
-"""Rows of a part of many rows that are folded, over their columns."""
+PART = 8  # rows of a part of many rows that are folded, over their columns
 
 
 def triangularize(matrix: FloatArray, columns: int, *, overwrite: bool = False) -> FloatArray:

@@ -59,8 +59,7 @@ from loopcal.typing import BoolArray, FloatArray
 
 # --- Solve closure limb by limb where the platform is given, in closed form.
 
-OPEN = 1e-9
-"""Residual of a closed row, relative to the robot's size."""
+OPEN = 1e-9  # residual of a closed row, relative to the robot's size
 
 
 def have_closed_form(program: Program) -> bool:
@@ -139,8 +138,8 @@ Newton's method ends there. A step that ends so much closer than it was long con
 quadratically. Other solutions of the same readings are at least ten times as far from each other,
 except close to a singularity.
 """
+# Smallest pivot of a limb's joints, relative to its largest, below which a limb is singular.
 SINGULAR = 1e-11
-"""Smallest pivot of a limb's joints, relative to its largest, below which a limb is singular."""
 
 
 class Iterate(NamedTuple):

@@ -31,8 +31,7 @@ from loopcal.engine.program import (
 )
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
-CHUNK = 1024
-"""Rows differentiated together."""
+CHUNK = 1024  # rows differentiated together
 
 
 def differentiate(
@@ -278,8 +277,7 @@ def _invert(
 
 # --- Rows of poses, [G D | r], folded for some trials at a time, so that they fit the cache.
 
-PART = 2048
-"""Poses whose rows are made together."""
+PART = 2048  # poses whose rows are made together
 
 
 def fold_poses(

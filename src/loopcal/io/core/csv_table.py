@@ -74,10 +74,9 @@ def _keep_finite(values: FloatArray) -> FloatArray:
 
 # Numbers as text: the fewest digits that read back as the same double.
 
+# Significant digits that are tried, fewest first; 17 always suffice for one double. A number of
+# fewer than 15 that reads back is the nearest one of 15, whose zeros at the end are not written.
 DIGITS = range(15, 18)
-"""Significant digits that are tried, fewest first; 17 always suffice for one double. A number of
-fewer than 15 that reads back is the nearest one of 15, whose zeros at the end are not written.
-"""
 
 
 @cache
@@ -124,16 +123,10 @@ def parse_finite(text: str) -> float | None:
 
 WHAT = "measurement file"
 CONVERT_HINT = ", or convert an instrument's export by means of a profile (docs/exports.md)"
-
+# Keys by which a settings file is recognized among YAML files of the same name.
 SIDECAR_KEYS = ("kind", "kinds", "noise", "controller", "instrument", "reading_noise", "poses")
-"""Keys by which a settings file is recognized among YAML files of the same name."""
-
-BLOCK = 100_000
-"""Characters of rows that are split and parsed at once."""
-
-NAME_COLUMNS = ("pose", "use", "block", "kind", "session", "group")
-"""Columns whose cells are names."""
-
+BLOCK = 100_000  # characters of rows that are split and parsed at once
+NAME_COLUMNS = ("pose", "use", "block", "kind", "session", "group")  # columns whose cells are names
 _SETTING = re.compile(r"^#\s*[A-Za-z]\w*:(\s|$)")
 _HEADER = re.compile(r"^(?P<name>[^\[\]]*[^\[\]\s])\s*(\[(?P<unit>[^\[\]]*)\])?$")
 _ROUND_BRACKETS = re.compile(r"^(?P<name>[^()]*[^()\s])\s*\((?P<unit>[^()]*)\)$")

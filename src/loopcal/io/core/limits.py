@@ -235,8 +235,8 @@ ARRAYS_COUNT = FileLimit(
     "arrays of a run folder", 1_000, "arrays", "members of `arrays.npz`", "repeat the calibration"
 )
 
+# All limits, in the order of docs/files.md.
 LIMITS = tuple(value for value in vars().values() if isinstance(value, FileLimit))
-"""All limits, in the order of docs/files.md."""
 
 
 class CountLimit(NamedTuple):
@@ -269,31 +269,29 @@ REPLICATES = CountLimit(
 )
 WORKERS = CountLimit(4_096, "workers", "`workers` of `loopcal study run` and `extend`")
 SQUARES = CountLimit(100, "squares", "`columns` and `rows` of `loopcal board`, each")
-
+# The limits of counts, in the order of docs/files.md.
 COUNT_LIMITS = tuple(value for value in vars().values() if isinstance(value, CountLimit))
-"""The limits of counts, in the order of docs/files.md."""
 
 # The rule for names in files: of robots, limbs, actuators, poses, sessions, targets, columns.
 
 LONGEST_NAME, LONGEST_COMPOSED = NAME_LENGTH.count, COMPOSED_LENGTH.count
 """Characters of a name, and of one that is composed of others, such as `monday.tracker.x`."""
 
+# Keys of YAML files with composed names in or below them.
 COMPOSED_KEYS = frozenset(
     {"identified", "unknowns", "fixed", "stored_parameters", "of", "noise", "columns"}
 )
-"""Keys of YAML files with composed names in or below them."""
 
+# Keys of YAML files whose values are texts or patterns, not names.
 TEXT_KEYS = frozenset({"source", "comment", "format", "from", "ignore", "match", "missing"})
-"""Keys of YAML files whose values are texts or patterns, not names."""
 
 _EQUALS, _SIGNS = r"=@\uff1d\uff20", r"+\-\uff0b\uff0d"
 """Characters that begin a formula, also as wide ones, which spreadsheets of East Asia accept."""
 
+# A cell, or a part of a name that becomes one where a line is split, that is computed: it begins
+# with `=` or `@`, or with a sign and calls a function or another program. Signs and numbers, such
+# as the labels `+x` and `-1`, are none.
 _FORMULA = re.compile(rf'(?:^|[,;])[\s"]*(?:[{_EQUALS}]\s*[^\s,;]|[{_SIGNS}][^,;]*[(|!])')
-"""A cell, or a part of a name that becomes one where a line is split, that is computed: it begins
-with `=` or `@`, or with a sign and calls a function or another program. Signs and numbers, such as
-the labels `+x` and `-1`, are none.
-"""
 
 
 def find_fault(name: str, longest: int = LONGEST_NAME, is_text: bool = False) -> Finding | None:

@@ -37,8 +37,7 @@ from loopcal.io.core.text_file import (
     write_bytes,
 )
 
-FILES = "files"
-"""Key of the list of files in the document of a result folder."""
+FILES = "files"  # key of the list of files in the document of a result folder
 
 
 def refuse_outputs(
@@ -124,8 +123,7 @@ def replace_folder(
             place_folder(temporary, target, path, check)
 
 
-_BLANK = "0" * 64
-"""Stands for the document's own digest where this is computed."""
+_BLANK = "0" * 64  # stands for the document's own digest where this is computed
 
 
 class FolderKind(NamedTuple):

@@ -265,6 +265,7 @@ def _read_literal(allowed: tuple[Any, ...], node: Any, at: Location) -> Any:
     raise _MisfitError(f"{_name(at)} is {shown}{hint}. Allowed: {constants}", "", at)
 
 
+# Type of a field -> types that a file may have there, in words, and what to do.
 NEEDED: Mapping[type, tuple[tuple[type, ...], str, str]] = {
     float: ((int, float), "a number", "write a number"),
     int: ((int,), "a whole number", "write a number"),
@@ -274,7 +275,6 @@ NEEDED: Mapping[type, tuple[tuple[type, ...], str, str]] = {
     dict: ((dict,), "a mapping", "write 'key: value' lines"),
     types.NoneType: ((types.NoneType,), "nothing", "remove it"),
 }
-"""Type of a field -> types that a file may have there, in words, and what to do."""
 
 
 def _require(needed: Any, node: Any, at: Location, details: str = "") -> Any:

@@ -115,12 +115,9 @@ def is_open(path: Path, descriptor: int) -> bool:
 NEW, OLD = "new", "old"
 """States of a leftover: written beside its target, and set aside for its successor."""
 
-PATIENCE = 10.0
-"""Seconds to wait until another command has written the same folder."""
-
+PATIENCE = 10.0  # seconds to wait until another command has written the same folder
 _LEFTOVER = re.compile(r"\.loopcal-(new|old)-[0-9a-f]{16}-(.+)", re.DOTALL)
-_NAME_BYTES = 200
-"""Of the target's name in a temporary name; file systems allow 255 in all."""
+_NAME_BYTES = 200  # of the target's name in a temporary name; file systems allow 255 in all
 
 
 @contextmanager
@@ -332,9 +329,9 @@ def _read_time(path: Path) -> int:
 
 # Text and JSON files.
 
+# To open a file without waiting; not every system has all of these flags.
 OPEN_FLAGS = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
-"""To open a file without waiting; not every system has all of these flags."""
-
+# What to do about a file that the operating system does not open, by the number of its error.
 ACTIONS = {
     errno.EACCES: "check its permissions",
     errno.EPERM: "check its permissions",
@@ -342,7 +339,6 @@ ACTIONS = {
     "name the file itself",
     errno.ENOTDIR: "part of its path is a file, not a folder: correct the path",
 }
-"""What to do about a file that the operating system does not open, by the number of its error."""
 
 
 def as_path(path: Any, what: str) -> Path:
@@ -518,11 +514,8 @@ def _reason(error: OSError) -> str:
 
 # JSON text without NaN.
 
-PIECES = 10_000
-"""Pieces of JSON text, such as a number, that are put together at once."""
-
-LONGEST_WHOLE = 400
-"""Digits of a whole number that are read; a double has 309."""
+PIECES = 10_000  # pieces of JSON text, such as a number, that are put together at once
+LONGEST_WHOLE = 400  # digits of a whole number that are read; a double has 309
 
 
 def to_json(document: Mapping[str, Any]) -> str:

@@ -28,15 +28,15 @@ KEPT_TEXTS, KEPT_LENGTH = 32, 100_000
 (it is looked at before it is used), which takes as long as a fit.
 """
 
+# A line by which a file is recognized as one of loopcal; messages only quote such files.
 _KNOWN_KEY = re.compile(
     r"""^[\s{]*["']?(format|units|family|identified|kinds?|noise|controller|instrument|robot|poses"""
     r"""|unknowns|reading_noise|columns|delimiter|settings|closed_loop|name_mot)["']?\s*:""",
     re.MULTILINE,
 )
-"""A line by which a file is recognized as one of loopcal; messages only quote such files."""
 
+# A text that begins with a directive other than `%YAML 1.2`, after empty lines and comments.
 _DIRECTIVE = re.compile(r"(?:\s*(?:#.*)?\n)*%(?!YAML 1\.2\s)")
-"""A text that begins with a directive other than `%YAML 1.2`, after empty lines and comments."""
 
 
 @dataclass(frozen=True)
@@ -292,14 +292,13 @@ class _NodeReader:
 # Text of YAML: names in quotes where they need them, and one key added to or removed from a
 # file.
 
+# Text, or a number with its unit, that YAML 1.2, and the readers of YAML 1.1 in use, read as the
+# same text without quotes. To them y and n are no truth values, and y is the name of a column.
 PLAIN = re.compile(
     r"(?!(?:true|false|null|yes|no|on|off)\Z)[a-z][\w.-]*"
     r"|-?[0-9]+(?:\.[0-9]+)?(?:e[-+]?[0-9]+)? [a-z1]+",
     re.IGNORECASE,
 )
-"""Text, or a number with its unit, that YAML 1.2, and the readers of YAML 1.1 in use, read as the
-same text without quotes. To them y and n are no truth values, and y is the name of a column.
-"""
 
 
 def quote_scalar(text: str) -> str:
@@ -319,8 +318,7 @@ def format_flow(value: Any) -> str:
     return repr(float(value) + 0.0) if isinstance(value, float) else json.dumps(value)
 
 
-WIDTH = 110
-"""Characters that a value in one line may fill."""
+WIDTH = 110  # characters that a value in one line may fill
 
 
 def format_yaml(content: Mapping[str, Any], comments: Mapping[str, str] | None = None) -> str:
@@ -452,8 +450,7 @@ def _escape(text: str) -> str:
 
 # Names of other files in a file: they stay in the folder of the file that names them.
 
-KEYS = ("poses", "controller")
-"""Settings of measurement files that name another file."""
+KEYS = ("poses", "controller")  # settings of measurement files that name another file
 
 
 def find_reference(

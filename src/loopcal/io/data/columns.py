@@ -37,8 +37,7 @@ from loopcal.units import ABSOLUTE_ZERO, DISPLAY_UNITS, ROUNDING, SI_SYMBOLS, Di
 if TYPE_CHECKING:
     from loopcal.measure.kinds.kind import Kind
 
-LINK = ";"
-"""Separates the names of poses that one row compares."""
+LINK = ";"  # separates the names of poses that one row compares
 
 COMMANDED, MEASURED, SIGMA, COVARIANCE = "commanded.", "measured.", "sigma.", "cov."
 TIME, TEMPERATURE, NOTE = "time", "temperature", "note"
@@ -232,8 +231,8 @@ BLOCK_COLUMN = PoseColumn(
     is_required=True,
 )
 POSE_COLUMNS = (USE_COLUMN, BLOCK_COLUMN)
+# Columns, also settings, that name what rows share: fields of `Observations`.
 ROW_COLUMNS = ("session", "group")
-"""Columns, also settings, that name what rows share: fields of `Observations`."""
 
 
 class ColumnRule(NamedTuple):
@@ -260,6 +259,7 @@ def _text_rule(meaning: str, column: TextColumn) -> ColumnRule:
     return ColumnRule(column.name, "", meaning, lambda _robot, _kinds: (column,))
 
 
+# All columns, in the order of the file reference.
 RULES: tuple[ColumnRule, ...] = (
     _text_rule(
         f"name of the pose, or `a{LINK}b` in a row that compares two poses. Default: the number of "
@@ -365,10 +365,8 @@ RULES: tuple[ColumnRule, ...] = (
         lambda name: TextColumn(name) if name.startswith(NOTE) else None,
     ),
 )
-"""All columns, in the order of the file reference."""
 
-ROLES = (*NAME_COLUMNS, TIME, TEMPERATURE)
-"""Columns with the same meaning in every file."""
+ROLES = (*NAME_COLUMNS, TIME, TEMPERATURE)  # columns with the same meaning in every file
 
 
 def list_columns(robot: Mechanism, kinds: Sequence[Kind]) -> dict[str, Column]:
@@ -417,8 +415,8 @@ def name_covariance(a: str, b: str, robot: Mechanism) -> str:
     return f"{COVARIANCE}{name_measured(a, robot)}.{name_measured(b, robot)}"
 
 
+# Further columns of the operator's sheet of a plan.
 SHEET_COLUMNS = ("step", "role", "hold", "tolerance")
-"""Further columns of the operator's sheet of a plan."""
 
 
 def find_column_fault(name: str, what: str) -> Finding | None:

@@ -82,22 +82,18 @@ NOISE_UNITS = {
     Dimension.RATIO: ("1", 1.0),
     Dimension.PIXEL: ("px", 1.0),
 }
-ASSUMED = "assumed"
-"""Word for noise that a program assumed."""
-
-MANY_SIGMAS = 3
-"""Number of columns above which an equal noise is written once."""
+ASSUMED = "assumed"  # word for noise that a program assumed
+MANY_SIGMAS = 3  # number of columns above which an equal noise is written once
 
 SQRT_3 = math.sqrt(3.0)
+# Key that states an uncertainty -> distribution and divisor; None where `k` is the divisor.
 FORMS: Mapping[str, tuple[str, float | None]] = {
     "sd": ("normal", 1.0),
     "limit": ("uniform", SQRT_3),
     "U": ("normal", None),
 }
-"""Key that states an uncertainty -> distribution and divisor; None where `k` is the divisor."""
 
-MOST_K = 10.0
-"""Largest coverage factor."""
+MOST_K = 10.0  # largest coverage factor
 
 
 @dataclass(frozen=True)
@@ -367,11 +363,11 @@ class KnownParameter:
     scope: Scope = "session"
 
 
+# Dimension -> record of the knowledge of a parameter.
 RECORDS = {
     dimension: type("KnownParameter", (KnownParameter,), {"GIVEN": dimension})
     for dimension in (Dimension.LENGTH, Dimension.ANGLE, Dimension.RATIO, Dimension.PIXEL)
 }
-"""Dimension -> record of the knowledge of a parameter."""
 
 
 Stated = tuple["StatedValue", YamlFile, Location]  # what is known, and where it is stated
@@ -596,9 +592,8 @@ class PermissibleError:
     scope: Scope = "session"
 
 
+# Setting -> record of what scales lengths.
 SCALED = {"scale": Scale, "temperature": PartTemperature, MPE: PermissibleError}
-"""Setting -> record of what scales lengths."""
-
 ITEMS: Mapping[str, str] = {"session_bias": "bias", "session_drift": "drift"}
 
 
@@ -721,14 +716,12 @@ SETTINGS: Mapping[str, str] = {
     "one. Default: from the robot file",
     "poses": "another file in this folder, with the readings of the poses",
 }
+# Settings of kinds that are columns, too, by which a row belongs to a kind.
 ROW_SETTINGS = ("camera", "board")
-"""Settings of kinds that are columns, too, by which a row belongs to a kind."""
-
+# Settings beside those of the kind itself.
 KIND_SETTINGS = ("noise", "noise_source", "instrument", *SHARED_ERRORS)
-"""Settings beside those of the kind itself."""
-
+# Settings of a file without measured values.
 POSE_SETTINGS = ("format", "robot", "controller", "reading_noise")
-"""Settings of a file without measured values."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -86,14 +86,13 @@ if TYPE_CHECKING:
     from loopcal.measure.measurements import Measurements
     from loopcal.measure.observations import Observations
 
+# Fewest targets on the base that may determine the frame of an instrument. A single one shows no
+# rotation, and no other target would reveal its error.
 FEWEST = 2
-"""Fewest targets on the base that may determine the frame of an instrument. A single one shows no
-rotation, and no other target would reveal its error.
-"""
 
 READING_NOISE = "reading_noise"
+# Difference, relative or in m or rad, up to which readings in different units are the same.
 ROUNDING = 1e-12
-"""Difference, relative or in m or rad, up to which readings in different units are the same."""
 
 T = TypeVar("T")
 
@@ -725,11 +724,10 @@ def _build_instrument(table: Table, kinds: Sequence[KindRows]) -> Instrument:
 
 # Text of measurement files and of templates.
 
+# Relative difference up to which the standard deviations of all rows are written as one number, and
+# correlation up to which there is none [1].
 EQUAL = 1e-9
-"""Relative difference up to which the standard deviations of all rows are written as one number,
-and correlation up to which there is none [1].
-"""
-
+# Remarks below the header of a template.
 ADDED = """\
 # Add one row for each pose below: its name, readings and measured values. Leave unmeasured
 # cells empty.
@@ -737,23 +735,22 @@ ADDED = """\
 #   laboratory: .., standard: .., calibrated: 2026-01-31, due: 2027-01-31, measured: 2026-05-31}
 # Optional columns: block, session, group, time, temperature [degC], sigma.NAME, note; see
 # docs/files.md."""
-"""Remarks below the header of a template."""
 
+# Remark of a template on a kind that compares poses.
 COMPARED = f"""\
 # A row of the kind {{}} compares two poses: name them in the column pose as a{LINK}b and leave its
 # readings empty. Each of these poses needs a separate row with its readings."""
-"""Remark of a template on a kind that compares poses."""
 
+# Remark of a template on targets of unknown place.
 UNKNOWN_TARGETS = """\
 # Replace the places of the targets above by yours: measured by hand from the origin of the platform
 # frame, to a few millimeters. A plan uses them; a calibration identifies them. A plan
 # needs no rows: it takes the instrument from the settings above."""
-"""Remark of a template on targets of unknown place."""
 
+# Remark of a template on an instrument whose frame is unknown.
 UNKNOWN_FRAME = """\
 # The instrument may stand anywhere: the fit finds its frame ({}). If it moves, even a
 # little, give the rows before and after it different names in a column session."""
-"""Remark of a template on an instrument whose frame is unknown."""
 
 
 def save_measurements(

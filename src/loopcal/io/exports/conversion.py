@@ -330,9 +330,8 @@ def _is_equal(cell: str, other: str) -> bool:
     return cell == other or (value is not None and value == parse_finite(other))
 
 
+# Accepted deviation of an exported matrix from a rotation [1]: the rounding of four decimals.
 ROTATION_ERROR = 1e-3
-"""Accepted deviation of an exported matrix from a rotation [1]: the rounding of four decimals."""
-
 QUATERNION = ("qw", "qx", "qy", "qz")
 
 

@@ -48,8 +48,7 @@ if TYPE_CHECKING:
 
 # Regular expressions of users, with a limit on their time.
 
-SECONDS_PER_LINE = 1e-4
-"""Time that each line of an export adds to the limit [s]."""
+SECONDS_PER_LINE = 1e-4  # time that each line of an export adds to the limit [s]
 
 Pattern = regex.Pattern[str]
 
@@ -109,8 +108,7 @@ def refuse_pattern(file: YamlFile, text: str, location: Location) -> None:
 DELIMITERS: Mapping[str, str | None] = {"comma": ",", "semicolon": ";", "tab": "\t", "spaces": None}
 DECIMALS: Mapping[str, str] = {"point": ".", "comma": ","}
 Place = int | str
-SOME_TIME = datetime(2026, 5, 4, 10, 22, 31, tzinfo=UTC)
-"""A time that a format must write and read."""
+SOME_TIME = datetime(2026, 5, 4, 10, 22, 31, tzinfo=UTC)  # a time that a format must write and read
 
 
 def normalize_name(text: str) -> str:
@@ -133,8 +131,7 @@ def _check_places(key: str, places: Sequence[Place]) -> None:
             raise ValueError(f"{sentence} place from 1. Correct it")
 
 
-TARGET = "{target}"
-"""Part of a name in the header that stands for each target."""
+TARGET = "{target}"  # part of a name in the header that stands for each target
 
 
 @dataclass(frozen=True)
@@ -326,12 +323,11 @@ class Profile:
 
 
 FORMAT = 1
+# Columns of text that an export may have.
 TEXTS = ("pose", *(column.name for column in POSE_COLUMNS), *ROW_COLUMNS)
-"""Columns of text that an export may have."""
-
+# The unit behind a name in a header, as in `X [mm]` or `X (mm)`.
 STATED = re.compile(r"[\[(]\s*(?P<unit>[^\[\]()]*?)\s*[\])]$")
-"""The unit behind a name in a header, as in `X [mm]` or `X (mm)`."""
-
+# Units as instruments write them -> ours.
 ALIASES: Mapping[str, str] = {
     "°": "deg",
     "°C": "degC",
@@ -341,7 +337,6 @@ ALIASES: Mapping[str, str] = {
     "inch": "in",
     '"': "in",
 }
-"""Units as instruments write them -> ours."""
 
 
 def read_profile(path: str | Path) -> Profile:

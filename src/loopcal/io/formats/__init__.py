@@ -13,6 +13,7 @@ from loopcal.registry import Registry
 if TYPE_CHECKING:
     from loopcal.io.formats.program_format import Format
 
+# Name -> format, which is imported when it is looked up.
 FORMATS: Registry[Format] = Registry(
     "format of another program",
     "loopcal.formats",
@@ -38,7 +39,6 @@ FORMATS: Registry[Format] = Registry(
         "csv": "loopcal.io.formats.import_export:CSV",
     },
 )
-"""Name -> format, which is imported when it is looked up."""
 
 
 def register_format(entry: Format) -> Format:

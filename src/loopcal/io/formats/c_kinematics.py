@@ -45,20 +45,19 @@ from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import SI_SYMBOLS
 from loopcal.version import __version__
 
-COORDINATES = (*POSITION, *TILT, *EULER)
-"""Platform coordinates in the order of the C file."""
+COORDINATES = (*POSITION, *TILT, *EULER)  # platform coordinates in the order of the C file
+# Terms of a transmission in the order of the C file.
 SHAPES = ("offset", "gain", "curve", *HARMONICS)
-"""Terms of a transmission in the order of the C file."""
 LINK = "LINK"
+# Tables that are not constant in a file with parameters.
 MOVABLE = ("double LINK", "struct limb", "double PITCH", "struct transmission")
-"""Tables that are not constant in a file with parameters."""
 TESTS, SEED = 50, 0
 """Poses of the test table, and the seed that draws them from the workspace."""
+# Largest distance from home of poses of a robot without a workspace: of its size, and [rad].
 NEAR = 0.02
-"""Largest distance from home of poses of a robot without a workspace: of its size, and [rad]."""
+# Largest difference of poses [m, 1] that the test in the file accepts, for a robot of a meter or
+# less: it is the rounding of some hundred operations, times the amplification of the mechanism.
 AGREEMENT = 1e-12
-"""Largest difference of poses [m, 1] that the test in the file accepts, for a robot of a meter or
-less: it is the rounding of some hundred operations, times the amplification of the mechanism."""
 
 
 class _Joint(NamedTuple):

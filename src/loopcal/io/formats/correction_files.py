@@ -37,8 +37,7 @@ if TYPE_CHECKING:
 
 Writer = Callable[[ExportSource], Exported]
 PROFILE = "loopcal"
-DIGITS = 9
-"""Significant digits of a CSV file: of a meter, a nanometer."""
+DIGITS = 9  # significant digits of a CSV file: of a meter, a nanometer
 
 
 def write_grid(source: ExportSource) -> Exported:

@@ -53,8 +53,8 @@ from loopcal.io.formats.program_format import (
 from loopcal.mechanism.families.linear_delta import LinearDelta
 from loopcal.plain_text import quote
 
+# Angles of the towers in firmware, before any correction [deg].
 NOMINAL_ANGLES = (210.0, 330.0, 90.0)
-"""Angles of the towers in firmware, before any correction [deg]."""
 
 Triple = tuple[float, ...]
 Words = dict[Name, float | str]
@@ -74,6 +74,7 @@ class DeltaGeometry:
     stops: Triple
 
 
+# Kinematics of firmware with closed loops -> the shipped robot that is most like it.
 CLOSED = {
     **dict.fromkeys(("corexy", "hybrid_corexy", "corexyu", "corexyuv"), "core-xy"),
     **dict.fromkeys(("winch", "hangprinter"), "cable-4"),
@@ -81,13 +82,12 @@ CLOSED = {
     "five-bar": "five-bar",
     "deltesian": "linear-delta",
 }
-"""Kinematics of firmware with closed loops -> the shipped robot that is most like it."""
 
+# Kinematics of RepRapFirmware by the number K of M669.
 KINEMATICS = (
     *("cartesian", "corexy", "corexz", "delta", "scara", "corexyu", "hangprinter"),
     *("polar", "corexyuv", "five-bar", "rotary_delta"),
 )
-"""Kinematics of RepRapFirmware by the number K of M669."""
 
 
 def report_kinematics(kinematics: str, sections: Sequence[str]) -> Finding:
@@ -162,10 +162,9 @@ WORD = re.compile(r"\s*([A-Z])[ \t]*(\{[^}]*\}|[^A-Z\s{]*)")
 ASIDE = re.compile(r'"[^"]*"?|;.*|\([^)]*\)?')
 CHECKSUM = re.compile(r"\*\s*\d*\s*$")
 UPPER = {ord(small): small.upper() for small in "abcdefghijklmnopqrstuvwxyz"}
-
 READ = ("M665", "M666", "M669", "M851")
+# Commands whose words are read, and commands that are followed by text.
 WITH_TEXT = ("M16", "M23", "M28", "M30", "M32", "M117", "M118")
-"""Commands whose words are read, and commands that are followed by text."""
 
 
 @dataclass(frozen=True)

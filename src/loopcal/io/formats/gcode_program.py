@@ -31,15 +31,10 @@ from loopcal.mechanism.platform_coordinates import get_dimension
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension, find_unit
 
+# Controlled coordinate -> word of RS-274.
 WORDS = {"x": "X", "y": "Y", "z": "Z", "roll": "A", "pitch": "B", "yaw": "C"}
-"""Controlled coordinate -> word of RS-274."""
-
-DEFAULT_FEED = 0.005
-"""Feed of moves [m/s], 300 mm per minute, whatever the unit of the program is."""
-
-SETTING_DECIMALS = 3
-"""Decimals of the feed and the pause in a program."""
-
+DEFAULT_FEED = 0.005  # feed of moves [m/s], 300 mm per minute, whatever the unit of the program is
+SETTING_DECIMALS = 3  # decimals of the feed and the pause in a program
 UNIT_CODES = {"mm": "G21", "in": "G20"}
 
 

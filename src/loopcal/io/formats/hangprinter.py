@@ -50,8 +50,7 @@ from loopcal.units import LARGEST
 DEG = math.pi / 180.0
 FREEDOMS, MOST_LINES = 3, 26
 NAMES = "ABCDEFGHIJKLMNOPQRSTUVWXYZ"
-ANCHORS_OF_FIRMWARE = "ABCDIJLO"
-"""Letters of the anchors in M669 of RepRapFirmware."""
+ANCHORS_OF_FIRMWARE = "ABCDIJLO"  # letters of the anchors in M669 of RepRapFirmware
 
 SAMPLES, POSITIONS, ANCHORS = "motor_pos_samp", "xyz_of_samp", "anchors"
 TAPED = "line_lengths_when_at_origin"
@@ -59,22 +58,14 @@ TEETH = ("motor_gear_teeth", "spool_gear_teeth")
 SPOOLS = ("spool_r_in_origin_first_guess", "mechanical_advantage", "lines_per_spool")
 READ = {SAMPLES, POSITIONS, ANCHORS, TAPED, *TEETH, *SPOOLS}
 FORCES = "force_samp"
-IGNORED = (FORCES, "springKPerUnitLength", "mover_weight")
-"""Keys that a robot file cannot express."""
-
+IGNORED = (FORCES, "springKPerUnitLength", "mover_weight")  # keys that a robot file cannot express
+# Keys without effect on the geometry.
 SILENT = ("_source", "abc_axis_min_force_limit", "abc_axis_max_force_limit")
-"""Keys without effect on the geometry."""
-
-WIDE = 200.0
-"""Tolerance of numbers that are first estimates [mm]: it leaves them to the data."""
-
+WIDE = 200.0  # tolerance of numbers that are first estimates [mm]: it leaves them to the data
+# Ratio of a taped length to that of the known poses at which the unit is another one.
 FAR_OFF = 10.0
-"""Ratio of a taped length to that of the known poses at which the unit is another one."""
-
 REMARK = "Readings are motor angles, zero at the origin; growing readings pay out line."
-DIGITS = 12
-"""Digits of the geometry in the robot file."""
-
+DIGITS = 12  # digits of the geometry in the robot file
 COMMENTS = {
     "parameters": "of the spools; buildup: growth of radius^2 for each length that is wound",
     "workspace": "assumed. Replace by the real workspace",

@@ -146,8 +146,7 @@ class KlipperConfig(ValueFile):
         lines += [*first, f"{MARK} [{section}]{end}", line]
 
 
-DELTAS = ("delta", "rotary_delta")
-"""Kinematics that are read and written."""
+DELTAS = ("delta", "rotary_delta")  # kinematics that are read and written
 
 
 def read_config(path: Path, allowed: Sequence[str] = DELTAS) -> KlipperConfig:
@@ -227,11 +226,10 @@ def parse_geometry(cfg: KlipperConfig) -> DeltaGeometry:
     )
 
 
-ROTARY_ANGLES = (30.0, 150.0, 270.0)
-"""Angles of the motors of a rotary delta by default [deg]."""
+ROTARY_ANGLES = (30.0, 150.0, 270.0)  # angles of the motors of a rotary delta by default [deg]
 SHOULDER = ("shoulder_radius", "shoulder_height")
+# Parameters of an arm, by its letter: end stop, angle of the motor, upper and lower arm.
 ROTARY_PARTS = ("{}.offset", "angle_{}.offset", "arm_{}.tip.x", "arm_{}.length")
-"""Parameters of an arm, by its letter: end stop, angle of the motor, upper and lower arm."""
 
 
 def format_rotary(

@@ -51,9 +51,7 @@ from loopcal.units import Dimension, find_unit
 COMPONENT = "genhexkins"
 LEAD, OFFSETS = "screw-lead", ("spindle-offset", "tool-offset")
 SIDES, UP = ("base", "platform"), np.array([0.0, 0.0, 1.0])
-ROUNDING = 1e-12
-"""Relative difference of numbers that count as the same."""
-
+ROUNDING = 1e-12  # relative difference of numbers that count as the same
 REMARK = "Readings are strut lengths, so the lengths at reading zero are 0."
 COMMENTS = {"stored_parameters": "what genhexkins stores", "tolerances": "measured by hand"}
 

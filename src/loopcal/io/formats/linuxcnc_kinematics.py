@@ -25,12 +25,11 @@ from loopcal.mechanism.kinematics import compute_readings
 from loopcal.mechanism.model import Mechanism
 from loopcal.units import UNITS, Dimension, Unit
 
-NAME = "loopcalkins"
-"""Name of the component, which its file must have."""
+NAME = "loopcalkins"  # name of the component, which its file must have
+# Characters of the name of a pin, of which HAL allows 47 with the component's name.
 LONGEST = 47 - len(f"{NAME}.")
-"""Characters of the name of a pin, of which HAL allows 47 with the component's name."""
+# Coordinate -> member of LinuxCNC's pose.
 AXES = {"x": "tran.x", "y": "tran.y", "z": "tran.z", "roll": "a", "pitch": "b", "yaw": "c"}
-"""Coordinate -> member of LinuxCNC's pose."""
 
 
 def write(source: ExportSource, into: Path | None) -> Exported:

@@ -37,12 +37,10 @@ from loopcal.io.formats.program_format import (
     round_length,
 )
 
-BELTS = ("bl", "br", "tr", "tl")
-"""Belts in the order of CLBM, which is that of the readings."""
+BELTS = ("bl", "br", "tr", "tl")  # belts in the order of CLBM, which is that of the readings
+# Coordinates by which the firmware defines its frame.
 ORIGIN = ("bl.anchor.x", "bl.anchor.y", "br.anchor.y")
-"""Coordinates by which the firmware defines its frame."""
-ANCHOR_SD = 30.0
-"""Tolerance of anchors that were taped [mm]."""
+ANCHOR_SD = 30.0  # tolerance of anchors that were taped [mm]
 BLOCK = re.compile(r"CLBM:\s*\[(.*?)\]")
 WAYPOINT = re.compile(
     r"\{" + r",\s*".join(rf"{belt}:\s*([^\s,{{}}]+)" for belt in BELTS) + r"\s*\}"

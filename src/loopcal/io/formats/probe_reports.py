@@ -30,21 +30,18 @@ from loopcal.typing import FloatArray
 if TYPE_CHECKING:
     from loopcal.measure.measurements import Measurements
 
-FEWEST = 7
-"""Points below which six numbers of a firmware cannot be determined and tested."""
-
+FEWEST = 7  # points below which six numbers of a firmware cannot be determined and tested
 NUMBER = r"([-+]?\d+(?:\.\d*)?|[-+]?\.\d+)"
 SINGLE = re.compile(rf"Bed X:\s*{NUMBER}\s*Y:\s*{NUMBER}\s*Z:\s*{NUMBER}(?![\d.,])", re.IGNORECASE)
+# A line that reports a point, whether or not its numbers can be read.
 TOUCH = re.compile(r"\bBed X:|^.*?\bX:\s*[-+]?\d*,\d+.*\bCount\b", re.IGNORECASE)
-"""A line that reports a point, whether or not its numbers can be read."""
 POSITION = re.compile(rf"^.*?\bX:\s*{NUMBER}\s*Y:\s*{NUMBER}\s*Z:\s*{NUMBER}\s.*\bCount\b")
 DRY_RUN = re.compile(r"Checking\.\.\. AC(?: at radius:\s*" + NUMBER + r")?.*\(DRY-RUN\)")
 CHECKING = re.compile(r"Checking\.\.\. AC")
 SETTING = re.compile(r"Height|Radius|\b[ET][xyz]:")
 PART = re.compile(rf"(?<![A-Za-z])(yz|zx|xy|c|x|y|z):\s*{NUMBER}")
+# Angles of the points of G33 around the center [deg].
 AROUND = {"x": 210.0, "y": 330.0, "z": 90.0, "yz": 30.0, "zx": 150.0, "xy": 270.0}
-"""Angles of the points of G33 around the center [deg]."""
-
 # Before 2.0, RepRapFirmware wrote no G32; its M122 prints five heights without their mean.
 HEIGHTS = re.compile(
     r"\bG32 bed probe heights:(.*?)(?:,\s*mean|$)|\bBed probe heights:(.*?),\s*mean", re.IGNORECASE
@@ -52,18 +49,17 @@ HEIGHTS = re.compile(
 POINT = re.compile(rf"^\s*(?:N\d+\s*)?G30(?!\d)(?=.*P(\d+))(?=.*X\s*{NUMBER})(?=.*Y\s*{NUMBER})")
 STOPPED = re.compile(rf"Stopped at height\s*{NUMBER}\s*mm")
 MOVE = re.compile(r"(?<![A-Z\d])G0*[01](?!\d)(.*)")
+# A G30 that reports the height at which it stops, at the place of the last move.
 TOUCHING = re.compile(r"(?<![A-Z\d])G30(?!\d)(?!.*P\s*\d).*S\s*-1(?!\d)")
-"""A G30 that reports the height at which it stops, at the place of the last move."""
 CALIBRATED = re.compile(r"Calibrated (\d+) factors using")
 HEIGHT_MAP = "RepRapFirmware height map file"
 GENERATED = re.compile(r"generated at (\d{4}-\d\d-\d\d)")
-
+# Command that states where the probe is beside the nozzle, and the height at which it triggers.
 OFFSETS = {"marlin": re.compile(r"\bM851\b(.*)"), "reprap": re.compile(r"\bG31\b(.*)")}
-"""Command that states where the probe is beside the nozzle, and the height at which it triggers."""
+# Median deviation of heights from their median [mm] beyond which their unit is another one.
 ROUGH = 5.0
-"""Median deviation of heights from their median [mm] beyond which their unit is another one."""
+# Median height [mm] from which a wrong trigger height is as probable as wrong end stops.
 SHIFTED = 1.0
-"""Median height [mm] from which a wrong trigger height is as probable as wrong end stops."""
 
 
 class ProbedPoint(NamedTuple):

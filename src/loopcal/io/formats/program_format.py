@@ -35,11 +35,9 @@ if TYPE_CHECKING:
     from loopcal.measure.observations import Observations
 
 MM = 1e-3
-
+# Standard deviations [m] that are assumed where nobody states them: of a probed height, of a
+# distance on a printed part, of line lengths, known positions and taped lengths of a cable robot.
 ASSUMED_NOISE = {"height": 20e-6, "distance": 0.1e-3, "line": 1e-3, "position": 1e-3, "tape": 10e-3}
-"""Standard deviations [m] that are assumed where nobody states them: of a probed height, of a
-distance on a printed part, of line lengths, known positions and taped lengths of a cable robot.
-"""
 
 
 @dataclass(frozen=True)
@@ -230,8 +228,7 @@ def get_byte_order_mark(path: Path) -> str:
     return "\ufeff" if read_bytes(path, "file").startswith(b"\xef\xbb\xbf") else ""
 
 
-DECIMALS = 6
-"""Decimals of written numbers [mm, deg]: those that Klipper itself saves, a nanometer."""
+DECIMALS = 6  # decimals of written numbers [mm, deg]: those that Klipper itself saves, a nanometer
 
 Name = tuple[str, str]
 Numbers = Mapping[Name, float | str]

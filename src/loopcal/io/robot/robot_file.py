@@ -55,11 +55,10 @@ from loopcal.units import Dimension, find_unit, to_si
 TABLE = "identified"
 PLUS_MINUS = "+/-"
 KEYS = ("name", "value", PLUS_MINUS, "unit")
-NOT_CALIBRATED = "# NOT CALIBRATED"
-"""Beginning of a robot file that a failed calibration made."""
+NOT_CALIBRATED = "# NOT CALIBRATED"  # beginning of a robot file that a failed calibration made
 EXAMPLE = "'{name: .., value: .., unit: ..}'"
+# Ending of the configuration of a printer -> its firmware; the formats build on this module.
 PROGRAMS = {".cfg": "Klipper", ".g": "RepRapFirmware", ".gcode": "Marlin"}
-"""Ending of the configuration of a printer -> its firmware; the formats build on this module."""
 
 
 def add_table(file: YamlFile, robot: Mechanism, plus_minus: FloatArray | None = None) -> YamlFile:
@@ -137,8 +136,7 @@ def read_rows(file: YamlFile, robot: Mechanism) -> dict[str, float]:
 
 FORMAT = 1
 HEADER = ("format", "units", "family", TABLE)
-KEY = "stages"
-"""The key of the list of stages, and the name of the family of chains."""
+KEY = "stages"  # the key of the list of stages, and the name of the family of chains
 WHAT = "robot file"
 SHIPPED_ROBOTS = Path(__file__).parents[2] / "robots"
 
@@ -325,8 +323,8 @@ def _find_drives(file: YamlFile, location: Location) -> Location:
     return ("actuators", *location[1:]) if is_other else location
 
 
+# Keys of a stage that are not those of its family; both have a name.
 OWN_KEYS = ("on", "mount", "joint", "family")
-"""Keys of a stage that are not those of its family; both have a name."""
 
 
 def place_stages(file: YamlFile, chain: RobotRecord, units: Units) -> RobotRecord:
@@ -485,12 +483,11 @@ def _describe_default(field: dataclasses.Field[Any]) -> str:
 # Robot files made from others: a new robot of a family, and a robot with more parameters
 # fixed.
 
+# The shipped robot of a family that does not have the name of the family.
 EXAMPLES = {"gough": "hexapod-42", "limbs": "five-bar", "stages": "arm-6r"}
-"""The shipped robot of a family that does not have the name of the family."""
-
 WIDTH = 120
+# The file beside a new robot file from which editors know its keys.
 EDITOR_SCHEMA = "robot.schema.json"
-"""The file beside a new robot file from which editors know its keys."""
 
 
 def format_new_robot(family: str, name: str) -> str:

@@ -34,16 +34,16 @@ from loopcal.units import NUMBER, Dimension, find_unit
 if TYPE_CHECKING:
     from loopcal.io.runs.run_folder import Run
 
+# Unit of a condition of the environment -> unit in the D-SI.
 CONDITION_UNITS = {
     "degC": r"\degreecelsius",
     "K": r"\kelvin",
     "%": r"\percent",
     "hPa": r"\hecto\pascal",
 }
-"""Unit of a condition of the environment -> unit in the D-SI."""
 
 CONDITION = re.compile(rf"({NUMBER.pattern})\s*({'|'.join(CONDITION_UNITS)})", NUMBER.flags)
-
+# Key -> whether a text has its form, and the form in words.
 FORMS: Mapping[str, tuple[Callable[[str], Any], str]] = {
     "country": (re.compile("[A-Z]{2}").fullmatch, "two capital letters, as DE"),
     "language": (re.compile("[a-z]{2}").fullmatch, "two lower-case letters, as en"),
@@ -52,15 +52,14 @@ FORMS: Mapping[str, tuple[Callable[[str], Any], str]] = {
         ("value", "plus_minus"), (CONDITION.fullmatch, "a number and its unit, 20 degC")
     ),
 }
-"""Key -> whether a text has its form, and the form in words."""
 
+# Texts without which there is no certificate.
 NEEDED: tuple[Location, ...] = (
     *((key,) for key in ("number", "country", "begin", "end")),
     *((key, "name") for key in ("machine", "laboratory", "customer")),
     *(("machine", "serial_number"), ("laboratory", "country"), ("customer", "country")),
     ("persons", 0, "name"),
 )
-"""Texts without which there is no certificate."""
 
 
 @dataclass(frozen=True)
@@ -199,40 +198,36 @@ def load_administration(path: str | Path, is_complete: bool = True) -> Administr
 DCC, SI = "https://ptb.de/dcc", "https://ptb.de/si"
 XSI = "http://www.w3.org/2001/XMLSchema-instance"
 VERSION = "3.3.0"
-PROBABILITY = 0.95
-"""Coverage probability of the stated intervals."""
-
+PROBABILITY = 0.95  # coverage probability of the stated intervals
 SCOPE = (
     "The results concern the geometry in the region and under the conditions of the measured "
     "poses. They rest on the expected spreads as a prior, and do not cover influences outside the "
     "measurement, such as other loads, temperatures or speeds."
 )
+# What the results and the statements on limits are about.
 PREDICTED = (
     "The errors are of predicted poses at the recorded readings, without the measurement noise."
 )
-"""What the results and the statements on limits are about."""
 
+# Key of a bound of the error in a volume -> words.
 VOLUME_BOUNDS = {
     "simultaneous": "simultaneously at all points",
     "pointwise": "pointwise, at a single point",
 }
-"""Key of a bound of the error in a volume -> words."""
 
+# Dimension -> unit in the D-SI; ratios have the unit one.
 UNITS = {Dimension.LENGTH: r"\metre", Dimension.ANGLE: r"\radian"}
-"""Dimension -> unit in the D-SI; ratios have the unit one."""
-
+# Decision on a limit -> word of the schema.
 CONFORMITY = {
     "conforms": "pass",
     "does not conform": "fail",
     "neither conforms nor fails": "noPass",
 }
-"""Decision on a limit -> word of the schema."""
 
+# Characters that no XML document may hold.
 NOT_XML = re.compile("[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
-"""Characters that no XML document may hold."""
-
+# Elements whose text is that of an element `content`.
 IN_WORDS = ("name", "description", "declaration", "noQuantity")
-"""Elements whose text is that of an element `content`."""
 
 Content = Mapping[str, Any]
 """Elements by name, in order: a text, elements, or a list for several of one name. Names without a

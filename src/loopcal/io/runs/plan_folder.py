@@ -39,13 +39,11 @@ FORMAT = 1
 SHEET, DATA, RESULT = "plan.csv", "measurements.csv", "plan.json"
 PLAN = FolderKind("plan", RESULT, ("robot", "made_by"), (SHEET, DATA, "plan.png", "curve.png"))
 VIA = "via"
-DIGITS = 12
-"""Significant digits of a number: more than it was rounded to, fewer than a double has."""
+DIGITS = 12  # significant digits of a number: more than it was rounded to, fewer than a double has
 
 
+# Cell of `hold` at the first point of a group, which sets the coordinates of the others.
 FREE = "free"
-"""Cell of `hold` at the first point of a group, which sets the coordinates of the others."""
-
 INSTRUCTIONS = """\
 ## Points of the tool of {robot}, in this order. Point p0 of a group is free: move close to its row,
 ## stop, and note the position that the measuring machine shows. Move to each other point of the

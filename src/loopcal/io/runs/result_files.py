@@ -34,8 +34,7 @@ if TYPE_CHECKING:
     from loopcal.apply.compensation import Compensation
 
 NAMES = ("rx", "ry", "rz", "x", "y", "z")
-DIGITS = 6
-"""Significant digits of an expected error."""
+DIGITS = 6  # significant digits of an expected error
 
 
 def load_targets(path: str | Path, robot: Mechanism) -> tuple[FloatArray, tuple[str, ...]]:

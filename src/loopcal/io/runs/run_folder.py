@@ -72,8 +72,8 @@ if TYPE_CHECKING:
 RESULT = "result.json"
 FORMAT = 2
 
+# Half a character: part of a file name that is not UTF-8.
 _SURROGATE = re.compile("[\ud800-\udfff]")
-"""Half a character: part of a file name that is not UTF-8."""
 
 
 Number = float | None
@@ -113,6 +113,8 @@ VOLUME: dict[str, Any] = {
         },
     ),
 }
+# What loopcal reads back from result.json: types by key, `[of]` for a list, `(of,)` for a value
+# that may be null, `*` for any key. A key with a question mark may be absent.
 STATED: dict[str, Any] = {
     "format": int,
     "made_by": {"command": [str], "inputs": {"*": {"path": str, "sha256": str}}},
@@ -137,9 +139,6 @@ STATED: dict[str, Any] = {
     "nulls?": {"*": str},
     "files": {"*": str},
 }
-"""What loopcal reads back from result.json: types by key, `[of]` for a list, `(of,)` for a value
-that may be null, `*` for any key. A key with a question mark may be absent.
-"""
 
 
 def make_type(form: Any) -> Any:
@@ -163,11 +162,8 @@ def get_record() -> Any:
     return make_type(STATED)
 
 
-ROUNDING = 1e-14
-"""Relative difference of an estimate in its unit and in SI."""
-
-LARGEST = 1e100
-"""Errors and variances of a budget are smaller; their squares are numbers."""
+ROUNDING = 1e-14  # relative difference of an estimate in its unit and in SI
+LARGEST = 1e100  # errors and variances of a budget are smaller; their squares are numbers
 
 
 def read_result(path: Path) -> dict[str, Any]:
@@ -215,9 +211,8 @@ def report_damage(path: Path, problem: str) -> FileError:
 # The arrays of a run folder: an archive of NumPy's, read without trust in what it says of itself.
 
 WHAT = "archive of arrays"
-KINDS = "biufU"
-"""Kinds of NumPy's types that a run contains: truth values, numbers and text."""
-
+KINDS = "biufU"  # kinds of NumPy's types that a run contains: truth values, numbers and text
+# What Python's and NumPy's readers raise about damaged archives, in addition to ValueError.
 FAULTS = (
     zipfile.BadZipFile,
     NotImplementedError,
@@ -227,10 +222,9 @@ FAULTS = (
     SyntaxError,
     tokenize.TokenError,
 )
-"""What Python's and NumPy's readers raise about damaged archives, in addition to ValueError."""
 
+# The last record of an archive, with its signature, members and bytes of the directory.
 END = struct.Struct("<4s4H2LH")
-"""The last record of an archive, with its signature, members and bytes of the directory."""
 
 
 def read_arrays(
@@ -284,6 +278,7 @@ def _read_member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarra
 
 # What loopcal reads back from the arrays.npz of a run: the declared form of its arrays.
 
+# Arrays by name: what each entry is, and the axes; a letter is one size in all arrays.
 FORMS: Mapping[str, str] = {
     "nominal": "finite p",
     "estimate": "finite p",
@@ -336,16 +331,12 @@ FORMS: Mapping[str, str] = {
     "heights_after": "finite h",
     "heights_held_out": "logical h",
 }
-"""Arrays by name: what each entry is, and the axes; a letter is one size in all arrays."""
-FITTED = "number rows values"
-"""Form of the fitted rows of a kind, `fitted_<number>_<kind>`."""
-
+FITTED = "number rows values"  # form of the fitted rows of a kind, `fitted_<number>_<kind>`
+# Beginnings of names of which a run has all arrays or none.
 GROUPS = ("frames_", "discrepancy_", "heights_", "posterior_shown_", "posterior_reading_")
-"""Beginnings of names of which a run has all arrays or none."""
-
 FITTED_NAME = re.compile(r"fitted_\d+_.+", re.DOTALL)
+# Word for an entry -> letter of its type in NumPy.
 TYPES = {"finite": "f", "number": "f", "whole": "i", "logical": "b", "text": "U"}
-"""Word for an entry -> letter of its type in NumPy."""
 
 
 def find_problem(arrays: Mapping[str, np.ndarray]) -> str | None:
@@ -574,8 +565,7 @@ class Run(Result):
         return data.take(fitted), data.take(held_out) if any(held_out) else None
 
 
-EQUAL = 1e-2
-"""Largest difference of a repeated estimate from that of a run, in standard deviations."""
+EQUAL = 1e-2  # largest difference of a repeated estimate from that of a run, in standard deviations
 
 
 def repeat_fit(
@@ -619,14 +609,13 @@ def list_inputs(result: Mapping[str, Any]) -> dict[str, Mapping[str, str]]:
 
 ARRAYS = "arrays.npz"
 RUN = FolderKind("run", RESULT, ("made_by", "fit"), (ARRAYS, ROBOT, FAILED_ROBOT))
-
+# Keys of `made_by` and their meanings, for the file reference.
 MADE_BY: Mapping[str, str] = {
     "command": "the command line, as a list of words",
     "versions": "versions of loopcal, numpy, scipy and python, and the engine that computed",
     "seeds": "all seeds in use, by name",
     "inputs": "each input file: its name as given, and its sha256",
 }
-"""Keys of `made_by` and their meanings, for the file reference."""
 
 
 def collect_provenance(

@@ -13,6 +13,7 @@ from loopcal.registry import Registry
 if TYPE_CHECKING:
     from loopcal.mechanism.families.records import RobotRecord
 
+# Records by the name of their family, imported when a robot file names it.
 FAMILIES: Registry[type[RobotRecord]] = Registry(
     "family of robots",
     "",
@@ -25,4 +26,3 @@ FAMILIES: Registry[type[RobotRecord]] = Registry(
         "stages": "loopcal.mechanism.families.stages:Stages",
     },
 )
-"""Records by the name of their family, imported when a robot file names it."""

@@ -50,12 +50,10 @@ from loopcal.units import Angle, Dimension, Given, Length, Ratio, Reading
 # Records. The reader of files takes the unit of a number from its annotation.
 
 
+# Distance of an anchor from the axis, as a share of the larger one, that is no lever.
 ON_AXIS = 1e-9
-"""Distance of an anchor from the axis, as a share of the larger one, that is no lever."""
-DEAD = 1e-6
-"""Sine of the angle from a dead point, below which the actuator does not turn the joint."""
-MOST_POINTS = 200
-"""Rows of a table."""
+DEAD = 1e-6  # sine of the angle from a dead point, below which the actuator does not turn the joint
+MOST_POINTS = 200  # rows of a table
 SKEW = "skew"
 
 
@@ -319,8 +317,8 @@ Coupling = AngleCoupling | LengthCoupling
 
 # Rows of driven joints: drives and couplings at their joints, and their unknowns.
 
+# Term `curve` per build-up: radius + buildup * reading / (2 pi), integrated.
 CURVE_OF_BUILDUP = 1 / (4 * np.pi)
-"""Term `curve` per build-up: radius + buildup * reading / (2 pi), integrated."""
 
 
 class Term(NamedTuple):

@@ -44,16 +44,13 @@ from loopcal.mechanism.transmission import readings_from_joints
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension
 
+# Smallest singular value of the works, relative to the largest, of independent joints.
 INDEPENDENT = 1e-6
-"""Smallest singular value of the works, relative to the largest, of independent joints."""
-SHOWN = 3
-"""Most sets of joints that are proposed."""
-TRIED = 12
-"""Most sets of joints that are built and verified."""
+SHOWN = 3  # most sets of joints that are proposed
+TRIED = 12  # most sets of joints that are built and verified
+# Standard deviation of an error without tolerance: of a length, relative to the robot's size; of an
+# angle [rad]; of a ratio [1].
 DEFAULT_ERROR = 1e-3
-"""Standard deviation of an error without tolerance: of a length, relative to the robot's size; of
-an angle [rad]; of a ratio [1].
-"""
 
 
 @dataclass(frozen=True, eq=False)

@@ -230,8 +230,8 @@ def rotate_about(axis: FloatArray, angle: float) -> FloatArray:
 
 # Error models: named parameters with their maps, by hand for `ideal`, by rule for `complete`.
 
+# Displacements of a link that its joint does not repeat.
 KEPT_AXES: Mapping[str, tuple[str, ...]] = {"R": ("rx", "ry", "x", "y"), "P": ("rx", "ry")}
-"""Displacements of a link that its joint does not repeat."""
 
 
 @dataclass(frozen=True)

@@ -130,6 +130,7 @@ def carriage_errors(
 
 # RU-PUS-PRS solar trackers: a platform on a post, tilted about two axes by two carriages.
 
+# Rotations of the post's axes: name, element, axis of the carried frame (base or platform).
 POST_ANGLES = (
     ("thOx", "pivot", "rx"),
     ("thOz", "pivot", "rz"),
@@ -138,10 +139,8 @@ POST_ANGLES = (
     ("thU2x", "platform", "rx"),
     ("thU2z", "platform", "rz"),
 )
-"""Rotations of the post's axes: name, element, axis of the carried frame (base or platform)."""
 
-LEFT_OUT = ("thOz", "thU1z")
-"""Parameters of the twenty-seven that the twenty-five leave out."""
+LEFT_OUT = ("thOz", "thU1z")  # parameters of the twenty-seven that the twenty-five leave out
 
 
 @dataclass(frozen=True)

@@ -53,8 +53,8 @@ from loopcal.units import ARTICLES, Angle, Dimension, Length, Ratio
 
 Movable = Literal["length", "lead", "pitch", "offset", "gain", "curve", "backlash"]
 MapAxis = Literal[Freedom, Movable]
+# What named parameters are mapped onto that keeps its sign: rods, screws and scales.
 POSITIVE = ("length", "lead", "gain")
-"""What named parameters are mapped onto that keeps its sign: rods, screws and scales."""
 
 
 @dataclass(frozen=True)

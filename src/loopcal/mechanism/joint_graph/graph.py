@@ -128,11 +128,9 @@ def turn_between(vector: FloatArray, target: FloatArray) -> FloatArray:
 # Coordinates in which a mechanism can be commanded: those that its motions change
 # independently.
 
+# Singular value, relative to the largest rate, above which coordinates are independent [1].
 INDEPENDENT = 1e-3
-"""Singular value, relative to the largest rate, above which coordinates are independent [1]."""
-
-STEEP = 0.2
-"""Cosine of the pitch below which roll and yaw are not used [1]."""
+STEEP = 0.2  # cosine of the pitch below which roll and yaw are not used [1]
 
 
 def choose_coordinates(T: FloatArray, twists: FloatArray) -> tuple[str, ...]:

@@ -24,11 +24,9 @@ from loopcal.mechanism.joint_graph.graph import GraphJoint, turn_between
 from loopcal.numerics.decomposition import are_nonzero
 from loopcal.typing import BoolArray, FloatArray
 
+# Singular value of the scaled closures, relative to the largest, that counts as zero [1].
 CLOSURE_RANK_TOLERANCE = 1e-8
-"""Singular value of the scaled closures, relative to the largest, that counts as zero [1]."""
-
-CLOSED = 1e-13
-"""Largest closure residual of a home pose, lengths as a share of the largest one [1]."""
+CLOSED = 1e-13  # largest closure residual of a home pose, lengths as a share of the largest one [1]
 
 STEPS, LARGEST_STEP = 40, 0.6
 """Newton steps, and the largest change of a joint value in one of them [rad, sizes]."""
@@ -304,26 +302,17 @@ class JointGraph:
 STARTS, SPREAD = 24, 0.6
 """Tries to close the loops, and range of their first joint values [rad, sizes]."""
 
-FEW = 12
-"""Largest number of closures that are left out one by one, to find the wrong one."""
-
-SAME = 1e-6
-"""Difference of joint values of poses that count as one [rad, sizes]."""
-
-DRAWN = 1e-3
-"""Largest joint value of a pose that counts as the drawn one [rad, sizes]."""
-
+FEW = 12  # largest number of closures that are left out one by one, to find the wrong one
+SAME = 1e-6  # difference of joint values of poses that count as one [rad, sizes]
+DRAWN = 1e-3  # largest joint value of a pose that counts as the drawn one [rad, sizes]
+# Singular value of the closures, relative to the largest, below which a step leaves it out [1].
 WEAK = 1e-3
-"""Singular value of the closures, relative to the largest, below which a step leaves it out [1]."""
-
-ACROSS = 0.1
-"""Smallest sine between two axes from which their common point is computed [1]."""
+ACROSS = 0.1  # smallest sine between two axes from which their common point is computed [1]
 
 NEAR, NEAR_RANGE = 4, 0.15
 """Number of poses near a pose, and range of their motors [rad, sizes]."""
 
-IDLE = 1e-9
-"""Largest part of a motion, scaled, in which neither motors nor platform move [1]."""
+IDLE = 1e-9  # largest part of a motion, scaled, in which neither motors nor platform move [1]
 
 
 @dataclass(frozen=True)

@@ -103,11 +103,8 @@ def select_joints(graph: JointGraph, joints: Collection[GraphJoint]) -> JointGra
     )
 
 
-MOTION = 1e-9
-"""Smallest part of a motion that counts [m, rad]; rounding is below 1e-12."""
-
-ACROSS = 5e-5
-"""Smallest sine between a shift and the normal of its plane that counts [1]."""
+MOTION = 1e-9  # smallest part of a motion that counts [m, rad]; rounding is below 1e-12
+ACROSS = 5e-5  # smallest sine between a shift and the normal of its plane that counts [1]
 
 
 @dataclass(frozen=True, eq=False)
@@ -279,8 +276,7 @@ def _list_joint_twists(
 FIRM, FIRM_DRAWN = 0.5, 0.01
 """Share of the best firmness that a home pose must have, and the pose that was drawn [1]."""
 
-FLOATING = 6
-"""Number of passive joints by which a file lets the base of a machine float."""
+FLOATING = 6  # number of passive joints by which a file lets the base of a machine float
 
 PARALLEL, ALONG = 1e-9, 1e-12
 """Largest sine between axes that count as parallel, and component across an axis of a frame [1]."""
@@ -499,8 +495,7 @@ def _align_frame(paths: LimbPaths, T_body_frame: FloatArray) -> FloatArray:
 # From links, joints and welded frames to a mechanism: rigid bodies, pins, a tree and its
 # closures.
 
-COAXIAL = 1e-9
-"""Difference of two frames or axes that count as the same [m, 1]."""
+COAXIAL = 1e-9  # difference of two frames or axes that count as the same [m, 1]
 
 
 @dataclass(frozen=True, eq=False)
@@ -566,8 +561,8 @@ def assemble_graph(base: str, joints: Sequence[GraphJoint], motors: tuple[str, .
     return JointGraph(base, tree, closing, motors)
 
 
+# Largest difference between a joint and the one that it follows [rad, m], and of factors [1].
 MIMICS = 1e-9
-"""Largest difference between a joint and the one that it follows [rad, m], and of factors [1]."""
 
 
 def couple_joints(

@@ -60,18 +60,18 @@ ABSOLUTE, AT_NOMINAL, ALIGNED = FRAMES = ("absolute", "gauge at nominal", "align
 as the least deviation leaves them; with poses nearest to the nominal ones, which needs no truth;
 with poses nearest to the true ones.
 """
+# Error of a pose -> its components of a twist, and its unit.
 PARTS: Mapping[str, tuple[slice, float, str]] = {
     "position": (slice(3, None), MM, "mm"), "orientation": (slice(3), DEGREE, "deg"),
 }  # fmt: skip
-"""Error of a pose -> its components of a twist, and its unit."""
+# Of the errors over poses: the root mean square, the mean, the standard deviation.
 STATISTICS = ("", ", mean", ", standard deviation")
-"""Of the errors over poses: the root mean square, the mean, the standard deviation."""
 PARAMETERS, DETERMINED = "parameters", "determined parameters"
 """Norm of the errors of the parameters, and of their part that plane and line can determine."""
+# Singular values, relative to the largest, whose squares are rounding: log det cannot use them.
 SQUARED_ROUNDING = 1e-7
-"""Singular values, relative to the largest, whose squares are rounding: log det cannot use them."""
+# Groups that show whether the drawn ones determine all that planes and lines can determine.
 MORE_GROUPS = 3
-"""Groups that show whether the drawn ones determine all that planes and lines can determine."""
 Key = tuple[str, str]
 """A set of errors and a noise, as printed or as numbers in mm."""
 

@@ -51,14 +51,11 @@ from loopcal.studies.specification import (
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import SI_SYMBOLS, Dimension
 
-TO_PRINTED = np.array([1.0 / MM] * 3 + [1.0] * 3)
-"""From [m, rad] to the units of Tables 4 and 6."""
+TO_PRINTED = np.array([1.0 / MM] * 3 + [1.0] * 3)  # from [m, rad] to the units of Tables 4 and 6
+# Our names for the columns of Tables 2, 3 and 5.
 PARAMETERS = ("base.x", "base.y", "base.z", "length", "platform.x", "platform.y", "platform.z")
-"""Our names for the columns of Tables 2, 3 and 5."""
-ODD_POSE = "A2"
-"""The row of Table 4 that belongs to another machine."""
-ORDER = "xyz"
-"""R = Rz(gamma) Ry(beta) Rx(alpha), with which Table 4 was made; equation (2) differs."""
+ODD_POSE = "A2"  # the row of Table 4 that belongs to another machine
+ORDER = "xyz"  # R = Rz(gamma) Ry(beta) Rx(alpha), with which Table 4 was made; equation (2) differs
 ANGLES = geometry.parse_orientation(f"euler-{ORDER}")
 
 STATED, PRESUMED = "stated", "presumed"
@@ -72,10 +69,8 @@ MEASURED = "the measured ones"
 NEAR, WIDE, WORKSPACE = "as in the paper", "wide", "in the workspace"
 """Where poses lie."""
 DRAWN_POSES = 3  # purpose of a random stream
-MOST_DRAWN = 4
-"""Poses that are drawn for each that the machine with errors must reach."""
-MOST_FIRST = 3
-"""Numbers of poses that are tried, from the fewest."""
+MOST_DRAWN = 4  # poses that are drawn for each that the machine with errors must reach
+MOST_FIRST = 3  # numbers of poses that are tried, from the fewest
 
 PRINTED, SIZES = PaperFile(__file__, "published.yaml"), PaperFile(__file__, "sizes.yaml")
 
@@ -456,20 +451,17 @@ def draw_poses(setup: Setup, place: str, n: int, seed: int) -> FloatArray:
 # The whole study: compute everything, put it beside the printed tables, judge the claims.
 
 TEXT = published.PaperText(__file__)
-
 METHODS = {
     "before": "not calibrated",
     "alone": "leg by leg, unweighted (the paper)",
     "together": "all legs, weighted by the noise",
     "prior": "together, with expected spreads as prior (MAP)",
 }
+# Titles of the runs without noise, of which the second keeps the matrix of step 5.
 RUNS = ("without noise", "without noise, one matrix throughout")
-"""Titles of the runs without noise, of which the second keeps the matrix of step 5."""
-
 # Limits of decisions; a number between the two of a pair decides nothing.
 UNITS = (1.0, 2.0)  # of the last digit: a second one can come from the rounding of other tables
-OF_RULE = ("converges", "threshold_noise")
-"""Claims on what the rule of the paper leaves."""
+OF_RULE = ("converges", "threshold_noise")  # claims on what the rule of the paper leaves
 AS_GOOD = 1.1  # ratio of errors
 EXACT = 1e-6  # [mm] parameter error that steps without noise leave
 

@@ -41,34 +41,29 @@ from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension
 
 TEXT = published.PaperText(__file__)
-DIVERGED = "diverged"
-"""Cell of a number that a diverged fit does not have."""
-ROUNDING = 1e-10
-"""Size below which an error [mm, deg, tolerances] is rounding."""
+DIVERGED = "diverged"  # cell of a number that a diverged fit does not have
+ROUNDING = 1e-10  # size below which an error [mm, deg, tolerances] is rounding
 NOISE_COLUMNS = ("X [mm]", "Y [mm]", "Z [mm]", "phi [rad]", "theta [rad]", "psi [rad]")
+# Of a robot file, as far as it has them.
 DIMENSIONS = ("platform_radius", "base_radius", "rod", "post")
-"""Of a robot file, as far as it has them."""
+# Methods and measured coordinates of the columns of the identified errors.
 IDENTIFIED = (
     (LS, 6), (EARLY, 6), (RE, 6), (TSVD, 6), (RANKED, 5), (EARLY, 5), (RE, 5), (TSVD, 5),
     (WHITENED, 6), (PRIOR, 6), (PRIOR, 5),
 )  # fmt: skip
-"""Methods and measured coordinates of the columns of the identified errors."""
+# Tables of the paper with identified parameters and with output errors.
 TABLES = {"RU-PUS-PRS": (5, 7), "3-PRS": (6, 8)}
-"""Tables of the paper with identified parameters and with output errors."""
+# Figures of the paper with curves over lambda and k.
 FIGURES = {("RU-PUS-PRS", 6): 6, ("RU-PUS-PRS", 5): 8, ("3-PRS", 6): 10, ("3-PRS", 5): 11}
-"""Figures of the paper with curves over lambda and k."""
+# Figures of the paper with parameters by iteration, RU-PUS-PRS, by measured coordinates.
 HISTORIES = {6: 7, 5: 9}
-"""Figures of the paper with parameters by iteration, RU-PUS-PRS, by measured coordinates."""
 NAMED, LONG = 6, 50
 """Parameters named in a legend, and iterations above which their axis is logarithmic."""
 LABELS = ("position [mm]", "phi and theta [deg]")
-CURVES: Mapping[str, tuple[str, ...]] = {"RE": (RE, EARLY), "TSVD": (TSVD,)}
-"""In one figure."""
+CURVES: Mapping[str, tuple[str, ...]] = {"RE": (RE, EARLY), "TSVD": (TSVD,)}  # in one figure
 SETTING, LOG = {RE: "lambda", TSVD: "k"}, {RE: "xy", TSVD: "y"}
-NAMES = {"ls": LS, "ridge": RE, "tsvd": TSVD}
-"""Of the paper's methods that claims are judged by."""
-SHOWN = NAMES | {"early": EARLY}
-"""Of those in the evidence of claims."""
+NAMES = {"ls": LS, "ridge": RE, "tsvd": TSVD}  # of the paper's methods that claims are judged by
+SHOWN = NAMES | {"early": EARLY}  # of those in the evidence of claims
 Place = TypeVar("Place")
 
 

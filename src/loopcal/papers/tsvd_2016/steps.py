@@ -60,9 +60,10 @@ from loopcal.units import Dimension
 
 MM = 1e-3
 PRINTED, SIZES = PaperFile(__file__, "published.yaml"), PaperFile(__file__, "sizes.yaml")
+# Names in the paper, and of our robot files.
 ROBOTS = {"RU-PUS-PRS": "ru-pus-prs", "3-PRS": "3-prs"}
-"""Names in the paper, and of our robot files."""
 COLUMNS = ("x", "y", "z", "phi", "theta", "psi")
+# Root mean squares over the output range and over the parameters, and a share.
 MEASURES = (
     "position [mm]",
     "phi and theta [deg]",
@@ -70,9 +71,7 @@ MEASURES = (
     "parameters [tolerances]",
     "parameters farther from the truth than nominal [share]",
 )
-"""Root mean squares over the output range and over the parameters, and a share."""
-ERRORS = 3
-"""Purpose of a random stream."""
+ERRORS = 3  # purpose of a random stream
 
 SHORT, FINE = SIZES.find("short"), 0.05
 """Iterations of the paper, and leaps of iterations that are drawn, see `StepRule.ahead`."""
@@ -80,10 +79,10 @@ LS, RANKED, TSVD = "LS", "LS with rank detection", "TSVD"
 RE, EARLY = "RE, all steps", f"RE, {SHORT} steps"
 PICTURED = (LS, EARLY, RE, TSVD)
 WHITENED, CROSS, PRIOR = "whitened LS", "whitened ridge, GCV", "MAP"
+# Methods of the library: rows whitened, columns scaled by tolerance.
 LIBRARY: Mapping[str, Method] = {
     WHITENED: lc.LeastSquares(), CROSS: lc.Ridge(lc.GCV()), PRIOR: lc.MAP(),
 }  # fmt: skip
-"""Methods of the library: rows whitened, columns scaled by tolerance."""
 
 BEFORE = "before calibration"
 

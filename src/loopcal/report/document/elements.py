@@ -126,13 +126,10 @@ def _describe(element: Element) -> dict[str, Any]:
 
 TEMPLATE, STYLE = "report.html.j2", "report.css"
 FOLDER = Path(__file__).parent
-
-WIDEST = 6
-"""Columns from which a table is set in a smaller font."""
+WIDEST = 6  # columns from which a table is set in a smaller font
 
 
-SHORTEST = 16
-"""Rows up to which a table stays on one page of paper."""
+SHORTEST = 16  # rows up to which a table stays on one page of paper
 
 
 def render_html(document: Document) -> str:
@@ -258,8 +255,8 @@ class CalibrationRecord:
 # Options of a stored calibration in words.
 
 EMPTY: tuple[Any, ...] = (None, [], {})  # values of options that state nothing
+# Units of options that are numbers [SI].
 UNITS = {"limit_position": "m", "limit_angle": "rad", "volume": "[m, rad]"}
-"""Units of options that are numbers [SI]."""
 
 
 def list_options(options: Mapping[str, Any]) -> list[tuple[str, str]]:

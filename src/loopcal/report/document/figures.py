@@ -46,15 +46,13 @@ if TYPE_CHECKING:
 MOST_ROWS, MOST_PARAMETERS = 3000, 120
 """Rows that the figures of a report show, and parameters up to which it draws them."""
 
-MOST_MOTIONS = 20
-"""Undetermined combinations that the 3-D view can show."""
+MOST_MOTIONS = 20  # undetermined combinations that the 3-D view can show
 
 MAP_POSES, SEED = 200, 0
 """Poses of the accuracy map, and the seed of their draw."""
 
 Draw = Callable[[CalibrationRecord], Iterator[Element]]
-FIGURES: dict[Draw, str] = {}
-"""Function -> name of the section that shows its figure."""
+FIGURES: dict[Draw, str] = {}  # function -> name of the section that shows its figure
 
 
 def report_figure(section: str) -> Callable[[Draw], Draw]:

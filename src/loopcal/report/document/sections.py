@@ -77,10 +77,9 @@ from loopcal.results.tables import (
 from loopcal.units import Dimension, Unit
 
 Describe = Callable[[CalibrationRecord], Iterator[Element | None]]
+# Name of a section -> its title, and the function that yields its elements, and None where its
+# figures are; without None they are at the end.
 SECTIONS: dict[str, tuple[str, Describe]] = {}
-"""Name of a section -> its title, and the function that yields its elements, and None where its
-figures are; without None they are at the end.
-"""
 
 
 def describes_section(name: str, title: str) -> Callable[[Describe], Describe]:
@@ -117,8 +116,7 @@ def build_sections(record: CalibrationRecord, names: Iterable[str]) -> tuple[Sec
 
 # The page to sign: what was calibrated, by whom and how, the result, and the decision rule.
 
-SIGNATURE = ("signed by", "issued")
-"""Facts at the end of the page."""
+SIGNATURE = ("signed by", "issued")  # facts at the end of the page
 
 
 @describes_section("summary", "Calibration result")
@@ -207,27 +205,21 @@ def _list_errors(
             yield name, "position", None, max(values), None
 
 
+# Key of a characteristic of visited poses -> words.
 ISO_9283 = {"AP_p": "pose accuracy AP of positions", "RP_l": "pose repeatability RP of positions"}
-"""Key of a characteristic of visited poses -> words."""
 
 
 # Verdict and scope: may the values be used, what does that cover, and how accurate are poses.
 
-CONFORMITY = "conformity."
-"""Beginning of the codes of statements on limits."""
-
+CONFORMITY = "conformity."  # beginning of the codes of statements on limits
 OPEN = ("fit.unidentifiable", "fit.hardly", "workflow.undetermined", "workflow.frame", "setup.")
 OUTLYING = ("outliers.", "validation.blunder", "validation.unreachable", "fit.excluded", "fit.low")
 OF_PARAMETERS = ("prior.", "residuals.correlated-parameters")
+# Beginnings of the codes of findings that other sections list, each in the first that has it.
 OF_RESIDUALS = ("noise.", "residuals.")
-"""Beginnings of the codes of findings that other sections list, each in the first that has it."""
-
+# Beginnings of the codes of all findings that have a section.
 ELSEWHERE = (CONFORMITY, *OPEN, *OUTLYING, *OF_PARAMETERS, *OF_RESIDUALS)
-"""Beginnings of the codes of all findings that have a section."""
-
-TOP = 3
-"""Findings that this section shows, beside all failures and warnings."""
-
+TOP = 3  # findings that this section shows, beside all failures and warnings
 IMPORTANT = ("refusal", "failure", "warning")
 
 
@@ -429,11 +421,8 @@ def describe_residuals(record: CalibrationRecord) -> Iterator[Element | None]:
 
 # Values for controllers, where the result comes from, and the poses that it uses.
 
-LINES = 40
-"""Lines of a controller's file that the report shows."""
-
-MOST = 3000
-"""Labels of poses that the report lists."""
+LINES = 40  # lines of a controller's file that the report shows
+MOST = 3000  # labels of poses that the report lists
 
 
 @describes_section("controller", "Values for the controller")
@@ -529,10 +518,10 @@ def describe_maker(versions: Mapping[str, str]) -> str:
 
 # Several calibrations side by side: result, parameters, shifts, held-out errors.
 
+# Whether a machine has changed -> the color of the head, as of a verdict.
 HEADS: Mapping[bool | None, str] = {True: "not_calibrated", False: "calibrated", None: "undecided"}
-"""Whether a machine has changed -> the color of the head, as of a verdict."""
+# The same -> the name of the sentence below the title.
 SUMMARIES: Mapping[bool | None, str] = {True: "changed", False: "equal", None: "untested"}
-"""The same -> the name of the sentence below the title."""
 
 
 def build_comparison_document(comparison: RunComparison, made_by: str) -> Document:

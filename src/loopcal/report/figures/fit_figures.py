@@ -115,14 +115,10 @@ def _list_quantities(series: Sequence[ResidualSeries]) -> list[str]:
     return varying
 
 
-SIGMAS = "residual [sigma]"
-"""Label of an axis of whitened residuals."""
-
+SIGMAS = "residual [sigma]"  # label of an axis of whitened residuals
+# Residuals over sigma that 95 % do not exceed, if the stated noise is right.
 BAND = 1.959963984540054
-"""Residuals over sigma that 95 % do not exceed, if the stated noise is right."""
-
-MANY = 2000
-"""Points of a series from which they are embedded as a picture in SVG and PDF files."""
+MANY = 2000  # points of a series from which they are embedded as a picture in SVG and PDF files
 
 UPRIGHT, COLUMNS = 8, 3
 """Components up to which their numbers fit side by side, and panels of quantities in a row."""
@@ -408,8 +404,7 @@ def compute_correlation(covariance: FloatArray) -> FloatArray:
     return np.where(np.outer(usable, usable), covariance, np.nan) / np.outer(scale, scale)
 
 
-SMALLEST = 1e-16
-"""Change in tolerances below which a number is rounding and drawn at this value."""
+SMALLEST = 1e-16  # change in tolerances below which a number is rounding and drawn at this value
 
 
 @register("figure convergence", Identification)
@@ -450,8 +445,7 @@ def draw_convergence(fit: Identification) -> Figure:
 MOST_COMBINATIONS, MOST_PARAMETERS = 14, 48
 """Combinations and parameters that the picture of combinations shows."""
 
-FLOOR = 1e-18
-"""Share of the largest singular value at which a smaller one is drawn."""
+FLOOR = 1e-18  # share of the largest singular value at which a smaller one is drawn
 
 
 @register("figure", Identifiability)
@@ -539,13 +533,13 @@ def _draw_combinations(
     add_colorbar(figure, image, axes, "weight in prior sd, largest = 1 [1]", aspect=25, shrink=0.8)
 
 
+# Rule -> marker and color of the value of a regularization curve that it chooses.
 METHOD_MARKERS = {
     "GCV": ("v", COLORS[1]),
     "marginal likelihood": ("s", COLORS[2]),
     "lowest held-out error": ("o", COLORS[3]),
     "one standard error": ("D", COLORS[4]),
 }
-"""Rule -> marker and color of the value of a regularization curve that it chooses."""
 
 
 @register("figure", RegularizationCurves)

@@ -80,8 +80,7 @@ def _measure(
     return None if margins is None else Bbox.from_extents(*(place + margins))
 
 
-PIXELS = 96
-"""Pixels of an inch on a page."""
+PIXELS = 96  # pixels of an inch on a page
 
 
 class NotebookFigure(Figure):

@@ -160,11 +160,8 @@ def draw_budget_sources(budget: Mapping[str, Any]) -> Figure:
 
 # Uncertainty of poses over the workspace, in slices, beside the measured poses.
 
-SLICES = 3
-"""Slices of the workspace."""
-
-NEGLIGIBLE = 1e-9
-"""Uncertainty [rad] below which an orientation cannot change and is not drawn."""
+SLICES = 3  # slices of the workspace
+NEGLIGIBLE = 1e-9  # uncertainty [rad] below which an orientation cannot change and is not drawn
 
 
 @register("figure", AccuracyMap)
@@ -286,14 +283,12 @@ BEFORE, AFTER, LIMIT = COLORS[1], COLORS[0], COLORS[3]
 GOOD, OPEN, BAD = "#cfeadf", "#f3eccb", "#f6d5c3"
 """Colors of what a decision rule accepts, leaves open and rejects."""
 
-LEAST_ROOM = 0.12
-"""Share of a number line in which a word fits."""
-
+LEAST_ROOM = 0.12  # share of a number line in which a word fits
+# Kinds of measurement for which there is room, so that the bars of a single one are narrow.
 FEWEST_BARS = 5
-"""Kinds of measurement for which there is room, so that the bars of a single one are narrow."""
 
+# Ratio of the largest errors before and after from which their axis is logarithmic.
 LOGARITHMIC = 8.0
-"""Ratio of the largest errors before and after from which their axis is logarithmic."""
 
 
 @register("figure", Validation)
@@ -421,8 +416,7 @@ def _draw_kinds(axes: Axes, validation: Validation) -> None:
 
 # Several calibrations side by side: parameters with their intervals, shifts, held-out errors.
 
-MOST_ROWS = 60
-"""Parameters that a figure shows."""
+MOST_ROWS = 60  # parameters that a figure shows
 
 
 def _choose_style(k: int) -> dict[str, Any]:
@@ -566,11 +560,9 @@ def draw_run_shifts(comparison: RunComparison) -> Figure:
 
 # Errors of measured heights over x and y, before and after calibration.
 
-MOST_NUMBERS = 40
-"""Points up to which each has its error as a number."""
-
+MOST_NUMBERS = 40  # points up to which each has its error as a number
+# Of points that the fit used, and of those that it did not, with their words.
 HEIGHT_MARKERS = {"fitted": ("o", "used in the fit"), "held-out": ("s", "held out")}
-"""Of points that the fit used, and of those that it did not, with their words."""
 
 AREA, MARGIN = 110.0, 0.16
 """Area of a marker [pt^2], and margin around the points as a share of their range."""
@@ -766,11 +758,8 @@ def draw_curve(robot: Mechanism, curve: ErrorCurve) -> Figure:
 
 # A plan of planes with perpendicular lines: the points of each group in three views.
 
-VIEWS = ((0, 1), (0, 2), (1, 2))
-"""Pairs of coordinates: from above, from the front, from the side."""
-
-MOST_GROUPS = 8
-"""Groups with a label of their own in the legend."""
+VIEWS = ((0, 1), (0, 2), (1, 2))  # pairs of coordinates: from above, from the front, from the side
+MOST_GROUPS = 8  # groups with a label of their own in the legend
 
 
 @register("figure", SurfacePlan)

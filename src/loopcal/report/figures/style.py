@@ -17,14 +17,10 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+# Of series in turn.
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8c564b", "#7f7f7f")
-"""Of series in turn."""
-
-MARKERS = "os^DvP<>"
-"""Of series in turn."""
-
-FRAME_COLORS = ("#b22222", "#228b22", "#1e3fae")
-"""Of the axes x, y and z of a frame."""
+MARKERS = "os^DvP<>"  # of series in turn
+FRAME_COLORS = ("#b22222", "#228b22", "#1e3fae")  # of the axes x, y and z of a frame
 
 POSE, ERROR = "#5b3a8e", "#c2185b"
 """Of measured poses and of their errors; no limb has these colors."""
@@ -38,8 +34,7 @@ REFERENCE, PALE, DARK = "0.45", "0.75", "0.25"
 LINE, THIN, GRID = 1.4, 0.9, 0.3
 """Widths of lines of data, of reference lines, and of the grid [pt]."""
 
-DOT = 3.5
-"""Size of the marker of a measured value [pt]."""
+DOT = 3.5  # size of the marker of a measured value [pt]
 
 TITLE, LABEL, SMALL = 10, 9, 8
 """Sizes of the title of a figure, of axes, and of ticks and legends [pt]."""
@@ -50,14 +45,9 @@ MOST_LABELS, LONGEST = 45, 24
 CHARACTERS, HANDLE = 13.0, 7
 """Small characters of one inch, and those that the handle and the gaps of a legend take."""
 
-MOST_COLUMNS = 8
-"""Columns of a legend."""
-
-FEW_TICKS = (1.0, 2.0, 5.0)
-"""Numbers on a short logarithmic axis, times powers of ten."""
-
-TICKS = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0)
-"""Numbers on a logarithmic axis, times powers of ten."""
+MOST_COLUMNS = 8  # columns of a legend
+FEW_TICKS = (1.0, 2.0, 5.0)  # numbers on a short logarithmic axis, times powers of ten
+TICKS = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0)  # numbers on a logarithmic axis, times powers of ten
 
 WIDE, VERY_WIDE = 3.0, 100.0
 """Ratio of its ends from which a logarithmic axis has these numbers, and from which it has powers
@@ -66,8 +56,8 @@ of ten only; a shorter one has even steps.
 
 
 ZERO: dict[str, Any] = {"color": REFERENCE, "lw": THIN}
+# Styles of a line at zero, and of a reference that data are compared with.
 DASHED: dict[str, Any] = {**ZERO, "ls": "--"}
-"""Styles of a line at zero, and of a reference that data are compared with."""
 
 
 def start_figure(width: float, height: float) -> Figure:

@@ -55,14 +55,9 @@ from loopcal.units import DISPLAY_UNITS, Dimension, Unit, find_unit
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-LONGEST = 0.15
-"""Length of the longest drawn error or motion, as a share of the robot's size."""
-
-STEP = 1e-4
-"""Largest change of a value in a difference quotient, in robot sizes or as an angle."""
-
-SMALLEST = 1e-9
-"""Error or motion that is not drawn larger, as a share of the robot's size."""
+LONGEST = 0.15  # length of the longest drawn error or motion, as a share of the robot's size
+STEP = 1e-4  # largest change of a value in a difference quotient, in robot sizes or as an angle
+SMALLEST = 1e-9  # error or motion that is not drawn larger, as a share of the robot's size
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,11 +209,9 @@ of base and platform; the line from the platform to the tool, or from the anchor
 drive to its joint; an axis of a frame; the tool point.
 """
 
+# Roles of lines; all others are single points.
 LINES = ("limb", "axis", "guide", "rod", "cable", "base", "platform", "arm", "frame")
-"""Roles of lines; all others are single points."""
-
-PLANAR = {"x", "y", "rz"}
-"""Freedoms of a platform that moves in the x-y plane."""
+PLANAR = {"x", "y", "rz"}  # freedoms of a platform that moves in the x-y plane
 
 
 @dataclass(frozen=True, eq=False)
@@ -375,9 +368,7 @@ def _order_outline(points: FloatArray) -> IntArray:
 # A scene as JSON for the script of the 3-D view (tools/viewer).
 
 SCRIPT = Path(__file__).parent / "viewer.min.js"
-
-MOST_NUMBERS = 200_000
-"""Coordinates of robots at measured poses in one scene: 1.1 MB of text."""
+MOST_NUMBERS = 200_000  # coordinates of robots at measured poses in one scene: 1.1 MB of text
 
 BODY, BLACK, DRIVEN, UNBOUNDED = "#404040", "#000000", "#666666", "#8c8c8c"
 """Colors of the platform, of axes and the tool, of the legend of driven parts, and of poses whose
@@ -547,14 +538,11 @@ def _list_legend(scene: Scene, parts: tuple[Part, ...]) -> list[dict[str, str]]:
 
 # A scene as a picture.
 
-FLAT = 0.05
-"""Width of an upright plane that contains a machine, as a share of its largest extent."""
-
+FLAT = 0.05  # width of an upright plane that contains a machine, as a share of its largest extent
+# Room around the second view for names of limbs, as a share of the machine's larger extent.
 MARGIN = 0.08
-"""Room around the second view for names of limbs, as a share of the machine's larger extent."""
-
+# Directions of the second view, by the axes that it shows.
 VIEWS = {(0, 1): "from above", (0, 2): "from the side", (1, 2): "from the front"}
-"""Directions of the second view, by the axes that it shows."""
 
 
 @register("figure", Mechanism)

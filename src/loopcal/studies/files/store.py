@@ -43,20 +43,19 @@ from loopcal.studies.specification import NUMERICS, Study, list_conflicts
 from loopcal.typing import FloatArray, Progress, report_no_progress
 from loopcal.version import __version__
 
+# Types of network and cluster file systems, of folders that a virtual machine shares, and of user
+# programs on macOS, most of which reach a network.
 NETWORK = (
     *("9p", "acfs", "afpfs", "afs", "beegfs", "ceph", "cephfs", "cifs", "coda", "davfs", "fhgfs"),
     *("ftp", "gfs", "gfs2", "glusterfs", "gpfs", "lustre", "macfuse", "mmfs", "ncpfs", "nfs"),
     *("nfs3", "nfs4", "ocfs2", "orangefs", "osxfuse", "panfs", "pvfs2", "quobyte", "smb3", "smbfs"),
     *("vboxsf", "virtiofs", "wekafs", "webdav"),
 )
-"""Types of network and cluster file systems, of folders that a virtual machine shares, and of user
-programs on macOS, most of which reach a network.
-"""
 
+# File systems of user programs, but for those that are known to use a local disk.
 NETWORK_IN_USER_SPACE = re.compile(
     r"fuse\.(?!ext|ntfs|exfat|overlay|fuse-overlayfs|bindfs|portal|gvfsd|lxcfs|gocryptfs|encfs)"
 )
-"""File systems of user programs, but for those that are known to use a local disk."""
 
 
 def find_network_file_system(folder: Path) -> str | None:
@@ -82,21 +81,11 @@ def find_network_file_system(folder: Path) -> str | None:
     return found
 
 
-NAME = "study.sqlite"
-"""File name of a store in the folder of its study."""
-
-FORMAT = 2
-"""Version of the tables; a store of another one is refused."""
-
-APPLICATION = 0x6C6F6F70
-"""By which SQLite knows a file of ours ("loop")."""
-
-LONGEST_NAME = 200
-"""Characters of the name of a block in messages."""
-
-PATIENCE = 30.0
-"""Seconds to wait for another program that locks the file."""
-
+NAME = "study.sqlite"  # file name of a store in the folder of its study
+FORMAT = 2  # version of the tables; a store of another one is refused
+APPLICATION = 0x6C6F6F70  # by which SQLite knows a file of ours ("loop")
+LONGEST_NAME = 200  # characters of the name of a block in messages
+PATIENCE = 30.0  # seconds to wait for another program that locks the file
 TABLES = f"""
 BEGIN;
 PRAGMA application_id = {APPLICATION};
@@ -120,21 +109,18 @@ Levels = Mapping[str, str]
 """Factor -> name of its level: what a cell is called, whatever else a study contains."""
 
 
+# Bytes of a value in a store, which SQLite checks before it takes memory. A block of 2,000 trials
+# with 1,000 scores has 16 million.
 LONGEST = 1 << 26
-"""Bytes of a value in a store, which SQLite checks before it takes memory. A block of 2,000 trials
-with 1,000 scores has 16 million.
-"""
-
+# Whether a block has the types and the length of one with this number of scores.
 HAS_SHAPE = """
 typeof(key) = 'text' AND typeof(block) = 'integer' AND block >= 0
 AND typeof(trials) = 'integer' AND trials > 0 AND typeof(seconds) = 'real'
 AND seconds BETWEEN 0 AND 1e12 AND typeof(scores) = 'blob' AND length(scores) = 8 * trials * ?
 AND typeof(digest) = 'blob' AND typeof(levels) = 'text'
 """
-"""Whether a block has the types and the length of one with this number of scores."""
 
 WITH_CELLS = "FROM blocks LEFT JOIN cells ON cells.id = blocks.cell"
-
 OF_CELL = "FROM blocks WHERE cell = (SELECT id FROM cells WHERE levels = ?)"
 
 
@@ -407,8 +393,7 @@ def read_store(folder: Path) -> Iterator[StudyStore]:
         yield store
 
 
-STILL = "immutable=1"
-"""The mode of reading a store that nobody writes."""
+STILL = "immutable=1"  # the mode of reading a store that nobody writes
 
 
 def _connect(path: Path, mode: str) -> sqlite3.Connection:
@@ -471,8 +456,8 @@ def _refuse_others(path: Path, connection: sqlite3.Connection) -> None:
             raise FileError(report_finding("store.damaged"), path)
 
 
+# Errors of a full disk; SQLite calls a file that must not grow an error of input and output.
 FULL = {sqlite3.SQLITE_FULL, sqlite3.SQLITE_IOERR}
-"""Errors of a full disk; SQLite calls a file that must not grow an error of input and output."""
 UNREADABLE = {
     *(sqlite3.SQLITE_NOTADB, sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_SCHEMA),
     *(sqlite3.SQLITE_TOOBIG, sqlite3.SQLITE_MISMATCH),
@@ -500,8 +485,7 @@ def _report_errors(path: Path, full: str = "store.disk-full") -> Iterator[None]:
         raise FileError(finding, path) from error
 
 
-STUDY_FILE = "study.yaml"
-"""Name of the study file in the folder."""
+STUDY_FILE = "study.yaml"  # name of the study file in the folder
 
 PROGRAM, NUMERICS_PART, ENGINE = "loopcal", "numerics", "engine"
 """What has a version in a store; the engine is that of the process that made the store."""

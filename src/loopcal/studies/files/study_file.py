@@ -57,6 +57,7 @@ from loopcal.studies.specification import (
     check_question,
 )
 
+# Factor -> record of its levels.
 LEVELS: Mapping[str, type] = {
     "instruments": InstrumentLevel,
     "noise": NoiseLevel,
@@ -65,7 +66,6 @@ LEVELS: Mapping[str, type] = {
     "methods": MethodLevel,
     "effects": EffectsLevel,
 }
-"""Factor -> record of its levels."""
 
 
 SETTINGS = tuple(item.name for item in fields(StudySettings))

@@ -82,6 +82,7 @@ from loopcal.studies.specification import (
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension
 
+# Codes of the outcomes of a trial, by their number; new ones are added at the end.
 OUTCOMES: tuple[str, ...] = (
     "study.converged",
     "study.out-of-iterations",
@@ -92,7 +93,6 @@ OUTCOMES: tuple[str, ...] = (
     "study.diverged",
     "study.steps-remain",
 )
-"""Codes of the outcomes of a trial, by their number; new ones are added at the end."""
 
 _OF_STATUS = {
     DescentStatus.CONVERGED: 0,
@@ -115,14 +115,12 @@ def has_result(outcome: FloatArray | IntArray) -> BoolArray:
     return np.isin(outcome, (0, STEPS_REMAIN))
 
 
-POSE_TIME = 60.0
-"""Seconds from one pose to the next."""
-
+POSE_TIME = 60.0  # seconds from one pose to the next
+# Verdicts by their number.
 VERDICTS = (Verdict.CALIBRATED, Verdict.RESERVATIONS, Verdict.UNDECIDED, Verdict.NOT_CALIBRATED)
-"""Verdicts by their number."""
 
+# Half-width of the 95 % interval of a normal distribution, in standard deviations.
 LEVEL_95 = 1.959963984540054
-"""Half-width of the 95 % interval of a normal distribution, in standard deviations."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -390,11 +388,10 @@ def _fit_one(cell: PreparedCell, data: Measurements) -> FittedTrials:
 
 # The scores of a block.
 
+# Purpose of the random stream from which the errors of the readings of held-out poses come.
 HELD_OUT = 4
-"""Purpose of the random stream from which the errors of the readings of held-out poses come."""
 
-PARTS = {"position": slice(3, 6), "orientation": slice(0, 3)}
-"""Score -> its components of a twist."""
+PARTS = {"position": slice(3, 6), "orientation": slice(0, 3)}  # score -> its components of a twist
 
 
 @dataclass(frozen=True)

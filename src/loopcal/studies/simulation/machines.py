@@ -59,8 +59,8 @@ from loopcal.studies.specification import (
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension, parse_quantity
 
+# Robots that a process keeps; building one takes as long as fitting a few of its machines.
 KEPT_ROBOTS = 8
-"""Robots that a process keeps; building one takes as long as fitting a few of its machines."""
 
 
 @lru_cache(maxsize=KEPT_ROBOTS)
@@ -126,8 +126,7 @@ def resolve_patterns(table: ParameterTable, values: Mapping[str, str]) -> dict[s
     return resolved
 
 
-SURFACES = {"plane", "line"}
-"""Kinds of an instrument for points of planes and perpendicular lines."""
+SURFACES = {"plane", "line"}  # kinds of an instrument for points of planes and perpendicular lines
 
 
 def make_instrument(level: InstrumentLevel, noise: NoiseLevel) -> Instrument:
@@ -213,8 +212,8 @@ def check_effects(effects: EffectsLevel) -> None:
             )
 
 
+# Noise for which points on surfaces are planned [m]; it does not change which are best.
 SURFACE_SIGMA = 1e-3
-"""Noise for which points on surfaces are planned [m]; it does not change which are best."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -296,8 +295,8 @@ def make_fit_options(level: MethodLevel) -> FitOptions:
     return options if options.method else replace(options, method=MAP(InflatedTolerances()))
 
 
+# Purpose of the random stream of a trial from which the direction of drift and jump is drawn.
 EFFECTS = 3
-"""Purpose of the random stream of a trial from which the direction of drift and jump is drawn."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -67,15 +67,10 @@ from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension
 
 MM = 1e-3
-
-EPSILON = 1e-6
-"""Largest component of a step [mm, rad] at which the iteration ends by default."""
-
-LIMIT = 1_000_000
-"""Steps at most; ridge steps shorten slowly, and 100,000 of them are common."""
-
+EPSILON = 1e-6  # largest component of a step [mm, rad] at which the iteration ends by default
+LIMIT = 1_000_000  # steps at most; ridge steps shorten slowly, and 100,000 of them are common
+# Steps of least squares and truncated SVD at most, unless their number is stated.
 LINEARIZATIONS = 40
-"""Steps of least squares and truncated SVD at most, unless their number is stated."""
 
 SINGLE, AHEAD, BACK = 20, 0.5, 0.125
 """Steps of ridge that are computed one by one. How many are then taken with one H, as a share of
@@ -89,12 +84,10 @@ errors of poses differ by 1e-5 from those of 100,000 single steps on the 3-PRS. 
 they differ from those of leaps of 2 % by 1e-3 (median over machines) and 2e-2 (largest).
 """
 
-LOST = 1e4
-"""A step of more than this [mm, rad] has diverged: ten meters."""
+LOST = 1e4  # a step of more than this [mm, rad] has diverged: ten meters
 
 
-LEG_STEPS = 3
-"""Steps of a fit leg by leg, unless another number is stated."""
+LEG_STEPS = 3  # steps of a fit leg by leg, unless another number is stated
 
 Stop = Literal["step", "dQint"]
 """What the epsilon of a fit leg by leg limits: the largest component of a step [mm, rad], or the
@@ -303,8 +296,8 @@ def _count_steps(
 
 # The six least-squares problems of the paper's section 3: changes of leg length by parameters.
 
+# Share of a column of G, relative to its largest entry, that counts as no effect on a leg.
 SHARED = 1e-9
-"""Share of a column of G, relative to its largest entry, that counts as no effect on a leg."""
 
 
 @dataclass(frozen=True, eq=False)
