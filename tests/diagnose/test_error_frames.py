@@ -23,12 +23,12 @@ from loopcal.diagnose.fit_examination import estimate_calibration_gain
 from loopcal.diagnose.gauge_freedoms import probe_readings
 from loopcal.errors import EstimationError
 from loopcal.estimate.identification import identify
+from loopcal.estimate.information import frame_twists
 from loopcal.estimate.options import FitOptions
 from loopcal.estimate.penalties import LeastSquares
 from loopcal.estimate.posterior import FrameKnowledge, posterior_from_arrays
 from loopcal.estimate.prior import prior_from
 from loopcal.estimate.result import Identification
-from loopcal.estimate.unfixed_motions import frame_twists
 from loopcal.measure.instrument import Gaussian, Instrument, Sensor
 from loopcal.measure.kinds import KINDS
 from loopcal.measure.nuisance import StatedValue

@@ -10,7 +10,7 @@ import loopcal.estimate.pose_rows as blocks_module
 from loopcal.diagnose.fit_examination import check_start_values
 from loopcal.errors import EstimationError
 from loopcal.estimate import fit_descent as module
-from loopcal.estimate import unfixed_motions
+from loopcal.estimate import information
 from loopcal.estimate.descent import StepControl
 from loopcal.estimate.fit_descent import FEWEST_POSES, SHARE, select_part, spread_poses
 from loopcal.estimate.free_parameters import select_free_parameters
@@ -272,14 +272,14 @@ def test_motions_of_frames_are_those_that_all_rows_leave_open(monkeypatch, robot
     noise = Gaussian(np.full(len(kind.noise_columns), SIGMA))
     measured = simulate(robot, poses, Instrument((Sensor(kind, noise),)), 0)
     folded: list[int] = []
-    fold = unfixed_motions.FrameRows.add_rows
+    fold = information.FrameRows.add_rows
     monkeypatch.setattr(
-        unfixed_motions.FrameRows, "add_rows", lambda *parts: (folded.append(1), fold(*parts))
+        information.FrameRows, "add_rows", lambda *parts: (folded.append(1), fold(*parts))
     )
     fit = identify(robot, measured, LeastSquares())
     assert fit.posterior.frames is not None
     assert len(folded) == (2 if count else 1)  # where all motions are fixed, no more rows are
-    monkeypatch.setattr(unfixed_motions, "FIXED", np.inf)
+    monkeypatch.setattr(information, "FIXED", np.inf)
     plain = identify(robot, measured, LeastSquares())
     assert plain.posterior.frames is not None
     unfixed, expected = fit.posterior.frames.unfixed, plain.posterior.frames.unfixed

@@ -62,13 +62,16 @@ from loopcal.estimate.determinable_setup import (
 from loopcal.estimate.fit_linearization import FitLinearization
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.identification import exclude_poses, identify
-from loopcal.estimate.information import count_equations, has_equations_to_spare
+from loopcal.estimate.information import (
+    count_equations,
+    has_equations_to_spare,
+    list_instrument_frames,
+)
 from loopcal.estimate.penalties import LeastSquares
 from loopcal.estimate.posterior import DISCREPANCY
 from loopcal.estimate.prior import refuse_reused_rows
 from loopcal.estimate.problem import problem_of
 from loopcal.estimate.result import Identification
-from loopcal.estimate.unfixed_motions import list_instrument_frames
 from loopcal.findings import Finding, Severity, report_finding, sort_by_importance
 from loopcal.measure.array_checks import check_type
 from loopcal.measure.data_checks import check_duplicates, check_types

@@ -38,11 +38,11 @@ from loopcal.estimate.fit_linearization import (
     fold_sources,
     linearize_fit,
 )
+from loopcal.estimate.information import describe_frames, find_unfixed_motions
 from loopcal.estimate.linearization import Linearization
 from loopcal.estimate.posterior import DISCREPANCY, INFLATION, NOISE, TOLERANCES, combine_degrees
 from loopcal.estimate.problem import Problem
 from loopcal.estimate.result import Identification
-from loopcal.estimate.unfixed_motions import find_frame_knowledge
 from loopcal.findings import Finding, report_finding
 from loopcal.findings.wording import round_to_digits
 from loopcal.measure.array_checks import drop_repeats
@@ -712,15 +712,10 @@ def _halve(
             return None
         root, linearization, problem = halved
         if moves_frames:
-            frames = find_frame_knowledge(
-                problem,
-                linear.data,
-                linearization.deviation,
-                linearization.next_start,
-                fit.options.prior,
-                linearization,
-                fit.residual_test.sigma_scale**2,
-            )
+            at = linearization.deviation, linearization.next_start
+            found, prior = find_unfixed_motions(problem, *at), fit.options.prior
+            noise = fit.residual_test.sigma_scale**2
+            frames = describe_frames(problem, linear.data, found, prior, linearization, noise)
             posterior = replace(fit.posterior, discrepancy=None, frames=frames)
             effects = linearize_tool_errors(posterior, solution, frame)
         D, own = effects.by_parameters / fit.posterior.unit, effects.by_frame

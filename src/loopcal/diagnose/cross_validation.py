@@ -247,10 +247,8 @@ def score_leave_one_out(
     y = weight * (s * d.projections[0])
     blocks, member = np.unique(linked_blocks(data, data.undivided), return_inverse=True)
     square, equations = np.zeros((len(blocks), len(penalty))), np.zeros(len(blocks))
-    count, rows = (
-        problem.poses.count_rows(member, len(blocks)),
-        problem.leverage_rows(linearization),
-    )
+    count = problem.poses.count_rows(member, len(blocks))
+    rows = problem.leverage_rows(linearization)
     for numbers, _, A, r in iterate_blocks(rows, member, count):
         B = A @ d.directions[0]  # (blocks, m, p)
         residual = A @ z[0] - r - np.moveaxis(B @ y.T, -1, 0)
@@ -648,12 +646,8 @@ def compute_regularization_curves(
         for i, method in enumerate(methods):
             progress(i, len(methods), "cross-validating")
             chosen = replace(options, method=method)
-            fold = np.array(
-                [
-                    _mean_square(r, held)
-                    for r, _, held in _fit_folds(robot, data, chosen, folds, seed)
-                ]
-            )
+            fitted = _fit_folds(robot, data, chosen, folds, seed)
+            fold = np.array([_mean_square(of_fold, held) for of_fold, _, held in fitted])
             score[i] = fold.mean()
             if np.isfinite(score[i]):
                 error[i] = fold.std(ddof=1) / np.sqrt(folds)

@@ -35,9 +35,9 @@ from loopcal.diagnose.gauge_freedoms import (
     weigh_motions,
 )
 from loopcal.errors import EstimationError
+from loopcal.estimate.information import MOTIONS, frame_twists
 from loopcal.estimate.posterior import Posterior
 from loopcal.estimate.result import Identification
-from loopcal.estimate.unfixed_motions import MOTIONS, frame_twists
 from loopcal.findings import Finding, report_finding
 from loopcal.measure.measurements import Measurements
 from loopcal.mechanism.kinematics import compute_readings

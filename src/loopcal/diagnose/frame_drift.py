@@ -150,11 +150,8 @@ def estimate_frame_drifts(data: Measurements) -> tuple[FrameDrift, ...]:
         for session in dict.fromkeys(repeats.session):
             chosen = [i for i, name in enumerate(repeats.session) if name == session]
             if len(chosen) > 1:
-                own = repeats._replace(
-                    points=repeats.points[chosen],
-                    whitener=repeats.whitener[chosen],
-                    session=[session] * len(chosen),
-                )
+                arrays = repeats.points[chosen], repeats.whitener[chosen]
+                own = _Repeats(repeats.kind, *arrays, [session] * len(chosen))
                 drifts.append(_estimate_drift(own))
     return tuple(drifts)
 

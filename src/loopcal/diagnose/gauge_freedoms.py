@@ -23,9 +23,9 @@ import numpy as np
 from loopcal import geometry
 from loopcal.errors import MechanismError
 from loopcal.estimate.free_parameters import Combination, FreeParameters
+from loopcal.estimate.information import frame_twists
 from loopcal.estimate.linearization import spread_states
 from loopcal.estimate.result import Identification
-from loopcal.estimate.unfixed_motions import frame_twists
 from loopcal.findings import Finding, report_finding
 from loopcal.mechanism.chains import get_platforms
 from loopcal.mechanism.kinematics import compute_readings, find_directly_reachable, forward_trials
@@ -60,7 +60,7 @@ class GaugeFreedoms:
     frames: tuple[str, ...] = ()  # names of the moved frames: (), ("base",), ("platform",) or both
     count: int = 0  # number of independent combinations that move frames, and nothing else
     # (12, g) motions of the two frames by these combinations, in the units of
-    # `loopcal.estimate.unfixed_motions.frame_twists`, each of length one
+    # `loopcal.estimate.information.frame_twists`, each of length one
     motions: FloatArray = field(default_factory=lambda: np.zeros((12, 0)))
     has_scale: bool = False  # whether a further combination enlarges all poses by one factor
     still: int = 0  # number of independent combinations that change no pose

@@ -21,6 +21,7 @@ from loopcal.estimate.fit_descent import (
     report_closure_start,
 )
 from loopcal.estimate.free_parameters import Combination, FreeParameters, describe_null_space
+from loopcal.estimate.information import FrameRows, UnfixedMotions, describe_frames
 from loopcal.estimate.linearization import Linearization, PoseEstimates
 from loopcal.estimate.observation_rows import Residuals, linked_blocks
 from loopcal.estimate.options import FitOptions
@@ -58,7 +59,6 @@ from loopcal.estimate.result import (
     report_unknown_bias,
     report_used_poses,
 )
-from loopcal.estimate.unfixed_motions import FrameRows, UnfixedMotions, describe_frames
 from loopcal.findings import Finding, report_finding
 from loopcal.measure.fitted_rows import FittedRows, collect_fitted_rows
 from loopcal.measure.measurements import Measurements

@@ -23,7 +23,11 @@ from loopcal.estimate.determinable_setup import fix_undetermined_setup
 from loopcal.estimate.fit_analysis import ASSUMED, FitAnalysis
 from loopcal.estimate.fit_descent import fit_rows, fit_with_tolerances, get_method, repeat_trials
 from loopcal.estimate.free_parameters import FreeParameters, select_free_parameters
-from loopcal.estimate.information import has_equations_to_spare
+from loopcal.estimate.information import (
+    describe_frames,
+    find_unfixed_motions,
+    has_equations_to_spare,
+)
 from loopcal.estimate.linearization import PoseSolution, Start, linearize_rows
 from loopcal.estimate.losses import Loss
 from loopcal.estimate.options import FitOptions, merge_options
@@ -34,7 +38,6 @@ from loopcal.estimate.prior import refuse_reused_rows
 from loopcal.estimate.problem import Problem, problem_of, problem_of_trials
 from loopcal.estimate.residual_test import FEWEST_DEGREES
 from loopcal.estimate.result import Identification
-from loopcal.estimate.unfixed_motions import find_frame_knowledge
 from loopcal.findings import report_finding
 from loopcal.measure.array_checks import check_type
 from loopcal.measure.data_checks import check_actuators, check_types
@@ -517,9 +520,8 @@ def compute_trial_posterior(fits: IdentifiedTrials, trials: Trials, trial: int) 
     z = free.deviation(fits.values[chosen])
     start = problem.start(z)
     linearization = problem.linearize(z, start)
-    frames = find_frame_knowledge(
-        problem, data, z, linearization.next_start, linearization=linearization
-    )
+    found = find_unfixed_motions(problem, z, linearization.next_start)
+    frames = describe_frames(problem, data, found, linearization=linearization)
     prior = fits.prior_variance
     return compute_posterior(
         free.robot.with_values(fits.values[trial]),

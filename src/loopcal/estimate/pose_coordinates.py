@@ -41,6 +41,7 @@ from loopcal.mechanism.platform_coordinates import read_coordinates
 from loopcal.mechanism.solutions import differentiate_by_coordinates, inverse
 from loopcal.mechanism.states import Status
 from loopcal.numerics.decomposition import are_nonzero
+from loopcal.numerics.elimination import eliminate_columns
 from loopcal.numerics.trial_batch import map_arrays
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension
@@ -303,7 +304,11 @@ def measure_poses(
         ]
         residual, by_twist = (np.concatenate([part[i] for part in parts], axis=1) for i in (0, 1))
         closed, slope, is_closed, state = _linearize_freedoms(robot, T[active], state)
-        step, is_full = _least_squares_step(by_twist @ slope, residual)
+        stacked = np.concatenate([by_twist @ slope, residual[..., None]], axis=2)
+        count = slope.shape[-1]
+        found = eliminate_columns(np.pad(stacked, ((0, 0), (0, count), (0, 0))), count)
+        is_full = np.asarray(are_nonzero(found.singular_values, FULL_RANK).all(axis=1))
+        step = np.where(is_full[:, None], -found.solution[..., 0], 0.0)
         length, longest = np.linalg.norm(step, axis=1), LONGEST_MEASURED_STEP * robot.size
         step *= np.minimum(1.0, longest / np.maximum(length, longest))[:, None]
         twist = np.matmul(slope, step[..., None])[..., 0]
@@ -379,26 +384,6 @@ def _whitened_rows(
     residual = whiten(white, evaluated.residual.reshape(k, c, m))
     jacobian = np.matmul(white, evaluated.jacobian.reshape(k, c, m, 6))
     return residual.reshape(k, c * m), jacobian.reshape(k, c * m, 6)
-
-
-def _least_squares_step(rows: FloatArray, residual: FloatArray) -> tuple[FloatArray, BoolArray]:
-    """Return steps (k, m) of rows (k, h, m), and which rows determine all of it (k,).
-
-    Where they do not, the step is zero.
-    """
-    k, h, m = rows.shape
-    finite = np.asarray(np.isfinite(rows).all(axis=(1, 2)) & np.isfinite(residual).all(axis=1))
-    length = np.linalg.norm(np.where(finite[:, None, None], rows, 0.0), axis=1)
-    full = finite & (length > 0.0).all(axis=1) & (h >= m)
-    step = np.zeros((k, m))
-    if full.any():
-        U, s, Vt = np.linalg.svd(rows[full] / length[full, None], full_matrices=False)
-        good = are_nonzero(s, FULL_RANK).all(axis=1)
-        full[full] = good
-        along = np.matmul(np.swapaxes(U[good], 1, 2), -residual[full][..., None])
-        along = along / s[good][..., None]
-        step[full] = np.matmul(np.swapaxes(Vt[good], 1, 2), along)[..., 0] / length[full]
-    return step, full
 
 
 TRIED = 9

@@ -265,7 +265,7 @@ class FrameKnowledge:
     """How the measurements of a fit determine the frames of the base and the platform.
 
     unfixed : (12, k) orthonormal motions of both frames that change no measured value, see
-        `loopcal.estimate.unfixed_motions`; k = 0 where the measurements determine both frames.
+        `loopcal.estimate.information`; k = 0 where the measurements determine both frames.
     readings : (m, a) of measured poses, at most some hundred [m, rad].
     instruments : name, such as "tracker" or "monday.tracker" -> its frame.
     """

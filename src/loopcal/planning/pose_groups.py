@@ -27,10 +27,9 @@ import numpy as np
 from loopcal import engine
 from loopcal.errors import DataError
 from loopcal.estimate.free_parameters import FreeParameters
-from loopcal.estimate.information import ObservedPoses, observe_poses, observe_rows
+from loopcal.estimate.information import ObservedPoses, observe_poses, observe_rows, unfixed_motions
 from loopcal.estimate.linearization import PoseStates
 from loopcal.estimate.pose_coordinates import TwistCoordinates
-from loopcal.estimate.unfixed_motions import unfixed_motions
 from loopcal.measure.instrument import Gaussian, Instrument, Sensor
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.nuisance import NuisanceParameters, collect_nuisance_parameters

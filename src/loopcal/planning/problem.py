@@ -31,10 +31,14 @@ from loopcal.diagnose.error_frames import (
 )
 from loopcal.errors import DataError, EstimationError
 from loopcal.estimate.free_parameters import FreeParameters, select_free_parameters
-from loopcal.estimate.information import collect_information, count_equations, observe_poses
+from loopcal.estimate.information import (
+    collect_information,
+    count_equations,
+    find_unfixed_motions,
+    observe_poses,
+)
 from loopcal.estimate.posterior import SAME_MOTION
 from loopcal.estimate.problem import problem_of
-from loopcal.estimate.unfixed_motions import find_frame_knowledge
 from loopcal.findings import Finding, Quantity, report_finding
 from loopcal.measure.array_checks import check_type
 from loopcal.measure.data_checks import check_actuators, check_closure
@@ -335,8 +339,9 @@ def prepare_problem(
         earlier, n_equations = _fold_measured(free, measured)
         observable, labels = decompose_information(groups, earlier), measured.labels
         problem, z = problem_of(free, measured), free.deviation(robot.values[None])
-        known = find_frame_knowledge(problem, measured, z, problem.start(z))
-        unfixed = intersect_spaces(unfixed, known.unfixed, SAME_MOTION)
+        found = find_unfixed_motions(problem, z, problem.start(z))
+        still_open = unfixed[:, :0] if found is None else found.motions
+        unfixed = intersect_spaces(unfixed, still_open, SAME_MOTION)
     return PlanningProblem(
         free,
         mounted,

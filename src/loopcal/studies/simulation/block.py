@@ -30,8 +30,8 @@ from loopcal.engine import State
 from loopcal.errors import DataError, EstimationError
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.identification import IdentifiedTrials, identify, identify_trials
+from loopcal.estimate.information import frame_twists
 from loopcal.estimate.penalties import Ridge
-from loopcal.estimate.unfixed_motions import frame_twists
 from loopcal.measure.instrument import BlockStream, make_random_stream
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.simulation import Trials, simulate_trials
