@@ -336,15 +336,15 @@ BETTER = 5.0
 
 
 def judge_data(
-    free: FreeParameters, data: Measurements, start: FloatArray | None = None
+    free: FreeParameters,
+    data: Measurements,
+    start: FloatArray | None = None,
+    effort: Effort = THOROUGH,
 ) -> Comparison | None:
-    """Compare measurements with the robot without far rows, quickly from a given start; None where
-    it reaches too few poses.
-    """
+    """Compare measurements with the robot without far rows; None where it reaches too few poses."""
     reached = select_reached(free, data)[0]
     if reached is None:
         return None
-    effort = THOROUGH if start is None else QUICK
     return exclude_far_rows(compare_with_robot(free, reached, (), effort, start))
 
 
@@ -652,16 +652,16 @@ def search_interpretations(
     the data would fit where that is no evidence, because values so small fit by chance.
     """
     written = None if stated is None else stated.data
-    select = partial(_select_best, free, data, written, misfit)
-    singles = _test_all(free, data, written, misfit)
+    search = _Search(free, data, written, misfit)
+    select, singles = search.select_best, search.test_all()
     tried = dict(Counter(test.interpretation.slip for test in singles))
     best, count = select(singles, ALLOWED), 0
     if best is None and pairs:
-        parameters = _test_parameters(free, data, written, misfit)
+        parameters = search.test_parameters()
         tried |= Counter(test.interpretation.slip for test in parameters)
         best = select(parameters, ALLOWED)
     if best is None and pairs:
-        tested = list(_test_pairs(free, data, written, singles, misfit))
+        tested = list(search.test_pairs(singles))
         best, count = select(tested, ALLOWED), len(tested)
     if best is None:
         best = select(singles, misfit / FAR_BETTER if np.isfinite(misfit) else LARGEST)
@@ -710,103 +710,123 @@ def _test(
     return [_Test(*row) for row in zip(listed, *numbers, strict=True)]
 
 
-def _test_all(
-    free: FreeParameters,
-    data: Measurements,
-    reached: Measurements | None,
-    misfit: float,
-    nearest: int = NEAREST,
-) -> list[_Test]:
-    """Test all single interpretations of data as written: those of the values, together, only if
-    the robot reaches enough poses; those of the readings by their reach, and the `nearest` ones by
-    residuals before parameters change.
-    """
-    tests: list[_Test] = []
-    if reached is not None:
-        of_values, few = list(list_interpretations(reached)), reached.take(_select_few(reached))
+class _Search(NamedTuple):
+    """The search for an interpretation that fits far better than the data as written."""
 
-        def judge_values(promising: IntArray) -> FloatArray:
-            return compute_misfits(free, reached, [of_values[i] for i in promising], THOROUGH)
+    free: FreeParameters
+    data: Measurements  # as written
+    reached: Measurements | None  # where the robot reaches their poses; None where too few
+    misfit: float  # of the data as written
 
-        screened = compute_misfits(free, few, of_values, QUICK)
-        tests = _test(of_values, screened, judge_values, misfit)
-    robot, poses = free.robot, _select_few(data)
-    home = compute_readings(robot, robot.values[None], robot.home_state)[0, 0]
-    listed = list(list_reading_interpretations(data, robot.actuators, home))
-    readings = np.stack([each.apply(data).readings[poses] for each in listed])
-    near, start, size = guess_frames(free, data.take(poses), readings)
-
-    def judge(i: int, start: FloatArray | None = None, few: IntArray | None = None) -> float:
-        changed = listed[i].apply(data)
-        comparison = judge_data(free, changed if few is None else changed.take(few), start)
+    def judge(
+        self, data: Measurements, effort: Effort = THOROUGH, start: FloatArray | None = None
+    ) -> float:
+        """Return the misfit of interpreted data; infinite where too few poses are reached."""
+        comparison = judge_data(self.free, data, start, effort)
         return np.inf if comparison is None else comparison.misfit
 
-    screened = np.full(len(listed), np.inf)
-    for i in np.sort(np.argsort(size, kind="stable")[:nearest]).tolist():
-        screened[near[i]] = judge(int(near[i]), start[[i]], poses)
-    return tests + _test(listed, screened, lambda promising: list(map(judge, promising)), misfit)
+    def test_all(self, nearest: int = NEAREST) -> list[_Test]:
+        """Test all single interpretations of data as written: those of the values, together, only
+        if the robot reaches enough poses; those of the readings by their reach, and the `nearest`
+        ones by residuals before parameters change.
+        """
+        free, data, reached, misfit = self
+        tests: list[_Test] = []
+        if reached is not None:
+            of_values, few = list(list_interpretations(reached)), reached.take(_select_few(reached))
 
+            def judge_values(promising: IntArray) -> FloatArray:
+                return compute_misfits(free, reached, [of_values[i] for i in promising], THOROUGH)
 
-def _test_pairs(
-    free: FreeParameters,
-    data: Measurements,
-    reached: Measurements | None,
-    singles: Sequence[_Test],
-    misfit: float,
-) -> Iterator[_Test]:
-    """Yield tests of pairs: the most promising single ones, each with all others after it."""
-    for of_values in (True, False):
-        promising = [
+            screened = compute_misfits(free, few, of_values, QUICK)
+            tests = _test(of_values, screened, judge_values, misfit)
+        robot, poses = free.robot, _select_few(data)
+        home = compute_readings(robot, robot.values[None], robot.home_state)[0, 0]
+        listed = list(list_reading_interpretations(data, robot.actuators, home))
+        readings = np.stack([each.apply(data).readings[poses] for each in listed])
+        near, start, size = guess_frames(free, data.take(poses), readings)
+        screened = np.full(len(listed), np.inf)
+        for i in np.sort(np.argsort(size, kind="stable")[:nearest]).tolist():
+            few = listed[near[i]].apply(data).take(poses)
+            screened[near[i]] = self.judge(few, QUICK, start[[i]])
+
+        def judge_readings(promising: IntArray) -> list[float]:
+            return [self.judge(listed[i].apply(data)) for i in promising]
+
+        return tests + _test(listed, screened, judge_readings, misfit)
+
+    def test_parameters(self) -> list[_Test]:
+        """Test interpretations that have parameters of their own: setup items that are not declared
+        unknown, and other zeros of the readings.
+        """
+        free, written, reached, misfit = self
+
+        def test_each(listed: Sequence[Interpretation], data: Measurements) -> list[_Test]:
+            def judge(promising: IntArray) -> list[float]:
+                judged = [judge_data(free, listed[i].apply(data)) for i in promising]
+                return [np.inf if each is None else refine_misfit(each)[0] for each in judged]
+
+            few = _select_few(data)
+            screened = [self.judge(each.apply(data).take(few), QUICK) for each in listed]
+            return _test(listed, np.array(screened), judge, misfit)
+
+        poses = _select_few(written)
+        tests = test_each(
+            find_zero_interpretations(free, written, poses, not misfit > GROSS), written
+        )
+        for count in (1, 2):
+            if reached is not None and all(test.misfit > ALLOWED for test in tests):
+                tests += test_each(list(list_setup_interpretations(reached, count)), reached)
+        return tests
+
+    def test_pairs(self, singles: Sequence[_Test]) -> Iterator[_Test]:
+        """Yield tests of pairs: the most promising single ones, each with all others after it."""
+        free, data, reached, misfit = self
+        for of_values in (True, False):
+            promising = [
+                test
+                for test in singles
+                if test.interpretation.of_values == of_values and test.quick < LOWERED * misfit
+            ]
+            for base in sorted(promising, key=lambda test: test.quick)[:MOST_BASES]:
+                changed, left = base.interpretation.apply(data), reached
+                if not of_values:
+                    left = select_reached(free, changed)[0]
+                elif reached is not None:
+                    left = base.interpretation.apply(reached)
+                search = _Search(free, changed, left, min(misfit, base.quick))
+                for test in search.test_all(NEAREST_IN_PAIRS):
+                    pair = combine(base.interpretation, test.interpretation)
+                    yield test._replace(interpretation=pair)
+
+    def select_best(self, tested: Sequence[_Test], limit: float) -> Selection | None:
+        """Select the interpretation of the smallest misfit up to `limit` that is far better than
+        the data as written; None without one.
+        """
+        free, written, reached, misfit = self
+
+        def choose_data(interpretation: Interpretation) -> Measurements:
+            return reached if interpretation.of_values and reached is not None else written
+
+        better = [
             test
-            for test in singles
-            if test.interpretation.of_values == of_values and test.quick < LOWERED * misfit
+            for test in tested
+            if test.misfit <= limit
+            and test.misfit * BETTER < misfit
+            and is_informative(
+                free, choose_data(test.interpretation), test.interpretation, test.misfit
+            )
         ]
-        for base in sorted(promising, key=lambda test: test.quick)[:MOST_BASES]:
-            changed = base.interpretation.apply(data)
-            if not of_values:
-                changed_reached = select_reached(free, changed)[0]
-            else:
-                changed_reached = None if reached is None else base.interpretation.apply(reached)
-            bound = min(misfit, base.quick)
-            for test in _test_all(free, changed, changed_reached, bound, NEAREST_IN_PAIRS):
-                pair = combine(base.interpretation, test.interpretation)
-                yield test._replace(interpretation=pair)
-
-
-def _select_best(
-    free: FreeParameters,
-    data: Measurements,
-    reached: Measurements | None,
-    misfit: float,
-    tested: Sequence[_Test],
-    limit: float,
-) -> Selection | None:
-    """Select the interpretation of the smallest misfit up to `limit` that is far better than
-    `misfit`; None without one.
-    """
-
-    def choose_data(interpretation: Interpretation) -> Measurements:
-        return reached if interpretation.of_values and reached is not None else data
-
-    better = [
-        test
-        for test in tested
-        if test.misfit <= limit
-        and test.misfit * BETTER < misfit
-        and is_informative(free, choose_data(test.interpretation), test.interpretation, test.misfit)
-    ]
-    if not better:
-        return None
-    smallest = min(test.misfit for test in better)
-    equal = [t.interpretation for t in better if t.misfit <= max(EQUALLY * smallest, 1.0)]
-    best, *others = _drop_same(data, equal)
-    comparison = judge_data(free, best.apply(choose_data(best)))
-    if comparison is None:
-        return None
-    least, _ = refine_misfit(comparison)
-    if not (least * BETTER < misfit and least <= limit):
-        return None
-    return Selection(best, comparison, least, tuple(others))
+        if not better:
+            return None
+        smallest = min(test.misfit for test in better)
+        equal = [t.interpretation for t in better if t.misfit <= max(EQUALLY * smallest, 1.0)]
+        best, *others = _drop_same(written, equal)
+        comparison = judge_data(free, best.apply(choose_data(best)))
+        least = np.inf if comparison is None else refine_misfit(comparison)[0]
+        if comparison is None or not (least * BETTER < misfit and least <= limit):
+            return None
+        return Selection(best, comparison, least, tuple(others))
 
 
 def _drop_same(
@@ -837,37 +857,6 @@ def _select_few(data: Measurements) -> IntArray:
     if n <= count or shares_poses(data):
         return np.arange(n)
     return choose_evenly(n, count)
-
-
-def _test_parameters(
-    free: FreeParameters, data: Measurements, reached: Measurements | None, misfit: float
-) -> list[_Test]:
-    """Test interpretations that have parameters of their own: setup items that are not declared
-    unknown, and other zeros of the readings.
-    """
-
-    def test_each(listed: Sequence[Interpretation], data: Measurements) -> list[_Test]:
-        few = _select_few(data)
-
-        def screen(interpretation: Interpretation) -> float:
-            changed = select_reached(free, interpretation.apply(data).take(few))[0]
-            if changed is None:
-                return np.inf
-            return exclude_far_rows(compare_with_robot(free, changed, (), QUICK)).misfit
-
-        def judge(i: int) -> float:
-            comparison = judge_data(free, listed[i].apply(data))
-            return np.inf if comparison is None else refine_misfit(comparison)[0]
-
-        screened = np.array(list(map(screen, listed)))
-        return _test(listed, screened, lambda promising: list(map(judge, promising)), misfit)
-
-    zeros = find_zero_interpretations(free, data, _select_few(data), not misfit > GROSS)
-    tests = test_each(zeros, data)
-    for count in (1, 2):
-        if reached is not None and all(test.misfit > ALLOWED for test in tests):
-            tests += test_each(list(list_setup_interpretations(reached, count)), reached)
-    return tests
 
 
 # Data that another interpretation explains as well as the stated one cannot show which is true.
