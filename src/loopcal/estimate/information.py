@@ -186,7 +186,8 @@ def describe_frames(
     `find_unfixed_motions`.
 
     An earlier calibration may determine frames that these measurements do not. Without a
-    linearization, or a finite noise variance, the unknown frames of instruments are not described.
+    linearization, or a finite noise variance, the unknown frames of instruments are not described;
+    nor is a frame of unbounded uncertainty, as after a fit that did not converge.
     """
     readings = data.readings[choose_evenly(len(data.readings), MOST_READINGS)]
     readings = readings[np.isfinite(readings).all(axis=1)]
@@ -197,38 +198,22 @@ def describe_frames(
         unfixed = intersect_spaces(unfixed, prior.unfixed, SAME_MOTION)
     is_known = np.isfinite(noise)  # not that of a fit that did not converge
     eliminated = None if linearization is None or not is_known else linearization.nuisance
-    local = None if problem.nuisance is None else problem.nuisance.local
-    frames = _describe_instruments(problem.free, data, local, eliminated, noise, found.followed)
-    if np.linalg.norm(unfixed[:6]) > UNFIXED:
-        # a stated frame is that of the base, which something else leaves open, such as an anchor
-        frames = {name: frame for name, frame in frames.items() if frame.own.any()}
-    return FrameKnowledge(unfixed, readings, frames)
-
-
-def _describe_instruments(
-    free: FreeParameters,
-    data: Measurements,
-    local: NuisanceParameters | None,
-    eliminated: EliminatedNuisance | None,
-    noise: float,
-    followed: FloatArray | None,
-) -> dict[str, InstrumentFrame]:
-    """Return the frames in which the kinds of measurements measure.
-
-    A frame of unbounded uncertainty, as after a fit that did not converge, is left out.
-    """
-    frames: dict[str, InstrumentFrame] = {}
+    free, frames = problem.free, dict[str, InstrumentFrame]()
+    axes = (*setup.ROTATION_AXES, *setup.POSITION_AXES)
     for name, stated, is_unknown in list_instrument_frames(data):
         if not is_unknown:
             nothing = np.zeros((6, len(free)))
             frames[name] = InstrumentFrame(stated, nothing, np.zeros((6, 6)))
-        elif local is not None and eliminated is not None:
-            axes = (*setup.ROTATION_AXES, *setup.POSITION_AXES)
-            places = np.array([local.table.index(f"{name}.{axis}") for axis in axes])
-            frame = _describe_unknown(stated, places, eliminated, free, noise, followed)
+        elif problem.nuisance is not None and eliminated is not None:
+            table = problem.nuisance.local.table
+            places = np.array([table.index(f"{name}.{axis}") for axis in axes])
+            frame = _describe_unknown(stated, places, eliminated, free, noise, found.followed)
             if np.isfinite(frame.own).all() and np.isfinite(frame.by_parameters).all():
                 frames[name] = frame
-    return frames
+    if np.linalg.norm(unfixed[:6]) > UNFIXED:
+        # a stated frame is that of the base, which something else leaves open, such as an anchor
+        frames = {name: frame for name, frame in frames.items() if frame.own.any()}
+    return FrameKnowledge(unfixed, readings, frames)
 
 
 def list_instrument_frames(data: Measurements) -> Iterable[tuple[str, FloatArray, bool]]:

@@ -410,8 +410,12 @@ def first_poses(
         trial, pose = np.nonzero(missing.any(axis=2))
         T, is_full = measure_poses(robot, rows, trial, pose)
         if is_full.any():
-            where = (trial[is_full], pose[is_full])
-            begin = _begin_at_measured(robot, begin, missing, T[is_full], where)
+            solution = inverse(robot, T[is_full])
+            good = solution.closed
+            chosen = (trial[is_full][good], pose[is_full][good])
+            own = np.where(missing[chosen], solution.q[good], begin.q[chosen])
+            state = map_arrays(lambda array: array[0, good], solution.state)
+            begin = begin.put_poses(*chosen, PoseStates(state, own))
         if robot.program.sigma is None and not is_full.all():
             where = (trial[~is_full], pose[~is_full])
             begin = _begin_at_best_reading(robot, begin, missing, recorded, rows, where)
@@ -420,22 +424,6 @@ def first_poses(
     if len(q) < trials:
         begin = begin.take(np.zeros(trials, dtype=np.int64))
     return begin
-
-
-def _begin_at_measured(
-    robot: Mechanism,
-    begin: PoseStates,
-    missing: BoolArray,
-    T: FloatArray,
-    where: tuple[IntArray, IntArray],
-) -> PoseStates:
-    """Return starts with poses (trials, poses) at T (k, 4, 4), missing readings as there."""
-    solution = inverse(robot, T)
-    good = solution.closed
-    chosen = (where[0][good], where[1][good])
-    q = np.where(missing[chosen], solution.q[good], begin.q[chosen])
-    state = map_arrays(lambda array: array[0, good], solution.state)
-    return begin.put_poses(*chosen, PoseStates(state, q))
 
 
 def _begin_at_best_reading(
