@@ -138,6 +138,14 @@ def test_checks_may_measure_different_quantities() -> None:
     assert result.plot().axes
 
 
+def test_a_failed_calibration_does_not_hold() -> None:
+    run, truth = calibrate(1)
+    data = {"one": measure(run.robot, truth, 5, 85)}
+    failed = replace(run, result={**run.result, "verdict": "not_calibrated"})
+    assert "still holds" in str(lc.check_up(run, data))
+    assert "calibration of this run failed" in str(lc.check_up(failed, data))
+
+
 def test_planned_checks_run_from_the_command_line(tmp_path, monkeypatch, capsys) -> None:
     monkeypatch.chdir(tmp_path)
 

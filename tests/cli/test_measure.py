@@ -189,6 +189,7 @@ def test_a_session_of_another_sheet_and_other_folders_are_refused(measure, rows)
     measure([], "has changed since the plan", words="measure plan -o again")
     shutil.copy("plan/measurements.csv", "sheet.csv")
     measure([], "does not name its robot", words="measure sheet.csv -o s", code=1)
+    measure([], "no-plan: this measurement file does not", words="measure no-plan -o s", code=1)
 
 
 def test_a_damaged_line_is_named(measure, rows) -> None:

@@ -303,3 +303,11 @@ def test_plan_takes_the_instrument_from_a_file_without_rows(loopcal, folder) -> 
     words = "plan p.yaml -o plan --like t.csv --poses 6 --hold-out 0 --candidates 40"
     loopcal(f"{words} --stroke-margin 5mm")
     assert "# unknown: [frame]" in (folder / "plan" / "measurements.csv").read_text()
+
+
+def test_rounding_is_no_error_of_the_orientation(loopcal, folder) -> None:
+    """A delta turns its platform by 1e-16 degrees, which is none."""
+    words = "plan linear-delta -o heights --kind component --components z --poses 10"
+    said = loopcal(f"{words} --candidates 40").words
+    assert "mm before calibration" in said
+    assert " deg " not in said

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 
+from loopcal.apply.calibration_report import Verdict
 from loopcal.apply.validation import (
     REFUSED_SHARE,
     find_error_units,
@@ -219,6 +220,7 @@ def check_up(
     assert judged is not None
     last = done[-1]
     said: dict[str, Any] = {"check": last.name, "together": last.together, **judged.data}
+    said["failed"] = run.result["verdict"] == Verdict.NOT_CALIBRATED.name.lower()
     said |= {"p_value": last.p_value, "level": false_alarms, "a_year": a_year}
     finding = report_finding("checks.machine-unchanged", **said)
     if last.alarm:

@@ -149,6 +149,10 @@ def linearize_prediction(
     return Prediction(kept[:, :3], kept[:, 3:], free.robot.size, chosen)
 
 
+ROUNDING = 1e-9
+"""Share of the pose error up to which an error in position or orientation is none."""
+
+
 @dataclass(frozen=True, eq=False)
 class ExpectedErrors:
     """Errors of the tool, root mean square over the workspace: what a share of machines ends below,
@@ -168,10 +172,12 @@ class ExpectedErrors:
         return float(getattr(self, target))
 
     def to_quantities(self, robot: Mechanism) -> tuple[Quantity, ...]:
-        """Return the errors of the share above 0 in the units of the robot's file."""
+        """Return the errors of the share above rounding in the units of the robot's file."""
         pairs = ((self.position, Dimension.LENGTH), (self.orientation, Dimension.ANGLE))
         return tuple(
-            robot.to_quantity(value, dimension) for value, dimension in pairs if value > 0.0
+            robot.to_quantity(value, dimension)
+            for (value, dimension), arm in zip(pairs, (1.0, robot.size), strict=True)
+            if arm * value > ROUNDING * self.pose
         )
 
 

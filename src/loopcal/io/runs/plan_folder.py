@@ -24,7 +24,7 @@ import numpy as np
 from loopcal.errors import FileError
 from loopcal.io.core.csv_table import format_row, parse_exact
 from loopcal.io.core.outputs import FolderKind
-from loopcal.io.core.text_file import read_json, sha256
+from loopcal.io.core.text_file import open_bytes, read_json, sha256
 from loopcal.io.data.columns import COMMANDED, FIT, HELD_OUT, USE_COLUMN
 from loopcal.io.data.measurement_file import format_data_sheet, format_measurements
 from loopcal.mechanism.model import Mechanism
@@ -121,7 +121,8 @@ def find_plan_robot(sheet: Path) -> tuple[str, bool]:
     """Return the robot file that a plan was made for, and whether it has changed since; FileError
     where it is not known.
     """
-    file = _read_plan(sheet).get("made_by", {}).get("inputs", {}).get("robot", {})
+    with open_bytes(sheet, "measurement file"):
+        file = _read_plan(sheet).get("made_by", {}).get("inputs", {}).get("robot", {})
     path = str(file.get("path", ""))
     if not Path(path).is_file():
         sentence = "the plan of this sheet does not name its robot file"
