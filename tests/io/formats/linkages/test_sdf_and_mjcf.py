@@ -3,20 +3,29 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from loopcal import forward, inverse
 from loopcal.errors import LoopcalError
 from loopcal.io.formats import FORMATS
 from loopcal.io.formats.import_export import build_imported_robot
+from loopcal.io.formats.linkages import mjcf, sdf
+from loopcal.io.formats.linkages.tree import LinkTree, draw_links
 from loopcal.io.formats.program_format import ExportSource, ImportOptions
 from loopcal.mechanism.model import Mechanism
 from tests.io.formats.linkages.linkage_texts import write_mjcf, write_sdf
 from tests.io.formats.linkages.urdf_chains import make_digger, make_leg
-from tests.io.formats.linkages.urdf_machines import MachineJoint, UrdfSolver, write_machine
+from tests.io.formats.linkages.urdf_machines import (
+    MachineJoint,
+    UrdfSolver,
+    make_pose,
+    write_machine,
+)
 from tools.fuzz.sources import SOURCES
 
 AGREES = 1e-9
@@ -171,3 +180,88 @@ def test_mjcf_is_refused_in_one_sentence(tmp_path, case) -> None:
     (tmp_path / "robot.xml").write_text(text)
     with pytest.raises(LoopcalError, match=sentence):
         read(tmp_path / "robot.xml", "mjcf")
+
+
+def shift(tree: LinkTree, name: str, by: list[float], turn: list[float] | None = None) -> LinkTree:
+    """Return a tree of which the origin of a joint, or an end of a closure, moves in its frame."""
+    R = Rotation.from_rotvec(turn or [0.0, 0.0, 0.0]).as_matrix()
+    return tree.with_origins({name: tree.places[name].origin @ make_pose(R, by)})
+
+
+def find_numbers(text: str, pattern: str) -> np.ndarray:
+    """Return the numbers that a pattern finds in a file."""
+    (found,) = re.findall(pattern, text)
+    return np.array(found.split(), dtype=float)
+
+
+def test_a_site_in_a_turned_frame_is_corrected_along_the_axes_of_that_frame(tmp_path) -> None:
+    """In the body, the site (0.2, 0.3) is at (-0.3 + 0.1, 0.2), and its x axis is the y axis."""
+    path = tmp_path / "a.xml"
+    path.write_text(
+        '<mujoco><worldbody><body name="a"><joint name="q"/><frame pos="0.1 0 0" euler="0 0 90">'
+        '<site name="s" pos="0.2 0.3 0"/></frame></body><body name="b" pos="-0.2 0.2 0">'
+        '<joint name="r"/><site name="t"/></body></worldbody><equality>'
+        '<connect name="c" site1="s" site2="t"/></equality></mujoco>'
+    )
+    tree = mjcf.read_tree(path)
+    np.testing.assert_allclose(tree.places["c_parent"].origin[:3, 3], [-0.2, 0.2, 0], atol=1e-15)
+    text = tree.rewrite(tree, shift(tree, "c_parent", [0.05, 0.0, 0.0]))
+    at = find_numbers(text, r'site name="s" pos="([^"]*)"')
+    np.testing.assert_allclose(at, [0.25, 0.3, 0.0], atol=1e-12)  # [m], rounding
+
+
+@pytest.mark.parametrize("order", ["qk", "kq"])
+@pytest.mark.parametrize("zero", [0.0, 0.02])
+def test_the_turn_of_a_locked_joint_is_not_written_into_its_body(tmp_path, order, zero) -> None:
+    """Joint k is locked at 0.3 rad about y; the body b is 0.2 m above it, and q turns about z."""
+    places = {"q": [0.02, 0.0, 0.0], "k": [0.0, 0.03, 0.05]}
+    joints = {"q": '<joint name="q" pos="0.02 0 0"/>'}
+    joints["k"] = '<joint name="k" axis="0 1 0" pos="0 0.03 0.05"/>'
+    path = tmp_path / "a.xml"
+    path.write_text(
+        f'<mujoco><worldbody><body name="a" pos="0.1 0 0">{joints[order[0]]}{joints[order[1]]}'
+        '<body name="b" pos="0 0 0.2"><joint name="r" axis="1 0 0"/></body></body></worldbody>'
+        '<equality><joint joint1="k" polycoef="0.3"/></equality></mujoco>'
+    )
+    tree = mjcf.read_tree(path)
+    assert tree.rewrite(tree, tree) == path.read_text()
+    moved = shift(shift(tree, "q", [0.0, 0.01, 0.0], [0.0, 0.0, zero]), "r", [0.0, 0.0, 0.004])
+    again = tmp_path / "b.xml"
+    again.write_text(tree.rewrite(tree, moved))
+    turns = {"q": [0.0, 0.0, zero], "k": [0.0, 0.3, 0.0]}
+    T = make_pose(np.eye(3), [0.1, 0.0, 0.0])
+    for name in order:
+        R, shifted = Rotation.from_rotvec(turns[name]).as_matrix(), [0.0, 0.01 * (name == "q"), 0]
+        pivot = make_pose(np.eye(3), places[name])
+        T = T @ pivot @ make_pose(R, shifted) @ np.linalg.inv(pivot)
+    T = T @ make_pose(np.eye(3), [0.0, 0.0, 0.204])
+    np.testing.assert_allclose(draw_links(mjcf.read_tree(again))["b"], T, atol=1e-12)  # [m, 1]
+
+
+@pytest.mark.parametrize("frame", ["", "a", "__model__", "b"])
+def test_an_axis_in_the_frame_of_another_part_is_corrected(tmp_path, frame) -> None:
+    """The link b turns by 0.1 rad about z at q, and its next axis, of r, stays along x of b."""
+    yaw = 0.4
+    turns = {"": yaw, "b": yaw, "a": 0.0, "__model__": 0.0}
+    stated = Rotation.from_euler("z", turns[frame] - yaw).inv().as_matrix() @ [1.0, 0.0, 0.0]
+    said = f' expressed_in="{frame}"' if frame else ""
+    path = tmp_path / "a.sdf"
+    path.write_text(
+        '<sdf version="1.9"><model name="m"><link name="a"/>'
+        f'<link name="b"><pose>0.1 0 0 0 0 {yaw}</pose></link>'
+        '<link name="c"><pose relative_to="b">0 0.2 0 0 0 0</pose></link>'
+        '<joint name="q" type="revolute"><parent>a</parent><child>b</child>'
+        "<axis><xyz>0 0 1</xyz></axis></joint>"
+        '<joint name="r" type="revolute"><parent>b</parent><child>c</child>'
+        f"<axis><xyz{said}>{' '.join(map(repr, stated.tolist()))}</xyz></axis></joint>"
+        "</model></sdf>"
+    )
+    tree = sdf.read_tree(path)
+    np.testing.assert_allclose(tree.joints["r"].axis, [1.0, 0.0, 0.0], atol=1e-15)
+    assert tree.rewrite(tree, tree) == path.read_text()
+    moved = shift(tree, "q", [0.0, 0.0, 0.0], [0.0, 0.0, 0.1])
+    text = tree.rewrite(tree, moved)
+    turn = 0.1 if turns[frame] == 0.0 else 0.0
+    expected = Rotation.from_euler("z", turn).as_matrix() @ stated
+    written = find_numbers(text, r'name="r".*<xyz[^>]*>([^<]*)</xyz>')
+    np.testing.assert_allclose(written, expected, atol=1e-12)  # [1]

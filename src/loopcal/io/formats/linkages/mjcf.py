@@ -59,7 +59,7 @@ class _Reader:
     bodies: dict[str, FloatArray] = field(default_factory=dict)
     carriers: dict[str, str] = field(default_factory=dict)
     elements: dict[str, Element] = field(default_factory=dict)
-    sites: dict[str, tuple[str, FloatArray, Element]] = field(default_factory=dict)
+    sites: dict[str, tuple[str, FloatArray, Element, FloatArray]] = field(default_factory=dict)
     joints: list[TreeJoint] = field(default_factory=list)
     references: dict[str, float] = field(default_factory=dict)
     floating: list[str] = field(default_factory=list)
@@ -162,7 +162,7 @@ class _Reader:
                 self.read_body(child, parent, T, inherited)
             elif child.name == "site" and "name" in child.attributes:
                 place = T @ self.parse_pose(child, self.get_attributes(child, inherited))
-                self.sites[child.attributes["name"]] = parent, place, child
+                self.sites[child.attributes["name"]] = parent, place, child, T
             elif child.name in ("replicate", "attach", "composite", "flexcomp"):
                 sentence = f"<{child.name}> makes bodies that the file does not write"
                 raise child.error(f"{sentence}. Save the model from MuJoCo with all bodies first")
@@ -345,7 +345,7 @@ def _read_closure(
     is_derived, elements = True, (part if kind else None, None)
     if "site1" in stated:
         sites = [_find(reader.sites, stated.get(f"site{k}", ""), "site", part) for k in (1, 2)]
-        (first, A, a), (second, B, b) = sites
+        (first, A, a, _), (second, B, b, _) = sites
         elements, is_derived = (a, b), False
     else:
         first, second = stated.get("body1", ""), stated.get("body2", WORLD)
@@ -439,7 +439,14 @@ def rewrite(tree: LinkTree, other: LinkTree) -> str:
     raw = tree.text.encode()
     reader = _Reader(_include(parse_xml(tree.text, tree.path, WHAT), tree.path))
     reader.read_all()
-    (drawn, after), edits = map(draw_links, (tree, other)), list[Edit]()
+    # the file draws locked joints at zero
+    locked = [j for j in reader.joints if j.kind and not tree.joints.get(j.name, j).kind]
+    back = {j: geometry.invert_pose(tree.joints[j.name].origin) @ j.origin for j in locked}
+    tree, changed = (
+        one.with_joints(replace(j, origin=one.joints[j.name].origin @ T) for j, T in back.items())
+        for one in (tree, other)
+    )
+    (drawn, after), edits = map(draw_links, (tree, changed)), list[Edit]()
     for body, element in reader.elements.items():
         parent = reader.carriers[body]
         if body not in after or parent not in after:
@@ -473,11 +480,19 @@ def rewrite(tree: LinkTree, other: LinkTree) -> str:
                 element = elements[k]
                 if element is None or np.abs(shift).max() <= SAME:
                     continue
-                key = "pos" if element.name == "site" else "anchor"
-                stated = reader.get_attributes(element, "main").get(key, "0 0 0")
-                place = element.parse_numbers(stated, 3, key) + shift
-                edits.append(_replace(tree, raw, element, key, place))
+                edits.append(_replace(tree, raw, element, *_shift_point(reader, element, shift)))
     return apply_edits(tree.text, edits)
+
+
+def _shift_point(reader: _Reader, element: Element, by: FloatArray) -> tuple[str, FloatArray]:
+    """Return the attribute that states the point of a site or an anchor, and its value where the
+    point moves by (3,) [m] in its body; a site is written in the <frame> around it.
+    """
+    if element.name == "site":
+        _, place, _, outer = reader.sites[element.attributes["name"]]
+        return "pos", outer[:3, :3].T @ (place[:3, 3] + by - outer[:3, 3])
+    anchor = reader.get_attributes(element, "main").get("anchor", "0 0 0")
+    return "anchor", element.parse_numbers(anchor, 3, "anchor") + by
 
 
 def _write_pose(

@@ -51,6 +51,8 @@ KINDS = {
     "fixed": "",
 }
 GEARBOX = "gearbox"
+AXES_IN_MODEL = ("1.0", "1.2", "1.3", "1.4")
+"""Versions in which axes are written in the frame of the model."""
 UNLIMITED = 1e15
 """Limit from which a joint counts as unlimited; SDF writes 1e16 [rad, m]."""
 
@@ -138,6 +140,17 @@ def _find_elements(model: Element) -> dict[str, Element]:
     return {element.attributes.get("name", ""): element for element in named}
 
 
+def _turn_axis(axis: Element, frames: Frames, R_joint: FloatArray, in_model: bool) -> FloatArray:
+    """Return the rotation (3, 3) from the frame in which an axis is written to that of its joint,
+    which stands in the model as R_joint (3, 3).
+    """
+    xyz = axis.find("xyz")
+    frame = "" if xyz is None else xyz.attributes.get("expressed_in", "")
+    if frame or in_model or axis.get("use_parent_model_frame") in ("1", "true"):
+        return np.asarray(R_joint.T @ frames.place(frame or MODEL)[:3, :3])
+    return np.eye(3)
+
+
 def _read_joint(
     element: Element, frames: Frames, T_child_joint: FloatArray, in_model: bool
 ) -> SdfJoint:
@@ -162,11 +175,8 @@ def _read_joint(
         if axis is None:
             continue
         texts.append(axis.get("xyz") or "0 0 1")
-        axes[i] = element.parse_direction(texts[-1], f"joint {name!r}")
-        xyz = axis.find("xyz")
-        frame = "" if xyz is None else xyz.attributes.get("expressed_in", "")
-        if frame or in_model or axis.get("use_parent_model_frame") in ("1", "true"):
-            axes[i] = R_joint.T @ frames.place(frame or MODEL)[:3, :3] @ axes[i]
+        stated_axis = element.parse_direction(texts[-1], f"joint {name!r}")
+        axes[i] = _turn_axis(axis, frames, R_joint, in_model) @ stated_axis
         low, high = (axis.find("limit", key) for key in ("lower", "upper"))
         if i == 0 and stated != "continuous" and low is not None and high is not None:
             low, high = (e.parse_number(e.text, "limit") for e in (low, high))
@@ -210,7 +220,7 @@ def read_tree(path: Path) -> LinkTree:
         sentence = f"this SDF file has {len(models)} models. Allowed: one, without others in it"
         raise FileError(f"{sentence}. Write one model into a separate file", path)
     (model,) = models
-    in_model = root.attributes.get("version", "1.7") in ("1.0", "1.2", "1.3", "1.4")
+    in_model = root.attributes.get("version", "1.7") in AXES_IN_MODEL
     frames, joints = Frames(_find_elements(model), {}), []
     for element in model.find_all("joint"):
         T_child = _place_in_child(frames, element)
@@ -299,13 +309,14 @@ def rewrite(tree: LinkTree, other: LinkTree) -> str:
         base = before.place(tree.root) @ geometry.invert_pose(drawn[tree.root])
     links = {e.attributes.get("name", ""): e for e in model.find_all("link")}
     known = {name: base @ T for name, T in moved.items() if name in links}
-    places = [(links[name], T) for name, T in known.items()]
+    places, turned = [(links[name], T) for name, T in known.items()], dict[str, FloatArray]()
     for element in model.find_all("joint"):
         name, child = element.attributes.get("name", ""), element.get("child")
         if child in known:
             end = other.places.get(f"{name}_child")
             T = known[child] @ (_place_in_child(before, element) if end is None else end.origin)
             places.append((element, T))
+            turned[name] = T[:3, :3]
             if before.elements[name] is element:
                 known[name] = T
     after, edits = Frames(before.elements, known), []
@@ -314,20 +325,24 @@ def rewrite(tree: LinkTree, other: LinkTree) -> str:
         T = geometry.invert_pose(after.place(_get_reference(element))) @ place
         if np.abs(T - stated).max() > SAME:
             edits.append(write_pose(tree, element, T, stated))
-    axes = {name: (joint.axis, other.joints[name].axis) for name, joint in tree.joints.items()}
-    for one, two in zip(tree.constraints, other.constraints, strict=True):
-        axes[one.name] = one.axes[0], two.axes[0]
+    in_model = root.attributes.get("version", "1.7") in AXES_IN_MODEL
+    axes = [{j.name: (j.axis, j.axis_2) for j in one.joints.values()} for one in (tree, other)]
+    for one, of in zip((tree, other), axes, strict=True):
+        of |= {constraint.name: constraint.axes for constraint in one.constraints}
     for element in model.find_all("joint"):
-        stated, axis = axes.get(element.attributes.get("name", ""), (np.zeros(3), np.zeros(3)))
-        if np.abs(axis - stated).max() > SAME:
-            xyz = element.find("axis", "xyz")
-            if xyz is None or xyz.attributes.get("expressed_in"):
-                name = element.attributes.get("name", "")
-                act = "Write it in the frame of the joint"
-                raise element.error(f"the axis of {name!r} turns. {act}")
-            if element.get("axis", "use_parent_model_frame") in ("1", "true"):
-                axis = before.place_element(element)[:3, :3] @ axis
-            edits.append((xyz.end, xyz.close, format_numbers(axis)))
+        name = element.attributes.get("name", "")
+        for i, key in enumerate(("axis", "axis2")):
+            if (axis := element.find(key)) is None or name not in turned or name not in axes[0]:
+                continue
+            at = (before, before.place_element(element)[:3, :3]), (after, turned[name])
+            stated, new = (
+                _turn_axis(axis, *each, in_model).T @ of[name][i]
+                for each, of in zip(at, axes, strict=True)
+            )
+            if np.abs(new - stated).max() > SAME:
+                if (xyz := axis.find("xyz")) is None:
+                    raise element.error(f"the axis of {name!r} turns. Write it as <xyz>")
+                edits.append((xyz.end, xyz.close, format_numbers(new)))
     return apply_edits(tree.text, edits)
 
 
