@@ -15,8 +15,12 @@ from scipy.stats import chi2, kstest
 
 import loopcal as lc
 from loopcal.apply.calibration_report import Verdict
-from loopcal.diagnose.frame_drift import compare_shapes, estimate_frame_drifts, report_base_targets
 from loopcal.diagnose.gauge_freedoms import interpret_fit
+from loopcal.diagnose.measured_points import (
+    compare_shapes,
+    estimate_frame_drifts,
+    report_base_targets,
+)
 from loopcal.diagnose.model_discrepancy import check_lack_of_fit
 from loopcal.errors import DataError
 from loopcal.estimate.options import FitOptions

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import loopcal as lc
-from loopcal.diagnose.frame_drift import report_base_targets
+from loopcal.diagnose.measured_points import report_base_targets
 from loopcal.mechanism.workspace import resolve_poses
 
 ROBOT = lc.load_robot("linear-delta")

@@ -22,7 +22,7 @@ from loopcal.apply.simulated_measurements import (
 )
 from loopcal.cli.entry_point import main
 from loopcal.diagnose.conventions.convention_check import check_conventions
-from loopcal.diagnose.point_names import examine_points
+from loopcal.diagnose.measured_points import examine_points
 from loopcal.errors import DataError, FileError
 from loopcal.io.data.measurement_file import format_data_sheet, load_measurements
 from loopcal.io.exports.conversion import fill_sheet, read_sheet, save_converted

@@ -47,8 +47,8 @@ from loopcal.diagnose.error_causes import (
 )
 from loopcal.diagnose.error_frames import BASE, FITTED, RELATIVE
 from loopcal.diagnose.fit_examination import check_start_values, compute_reading_errors, examine_fit
-from loopcal.diagnose.frame_drift import compare_shapes, report_base_targets
 from loopcal.diagnose.gauge_freedoms import interpret_fit
+from loopcal.diagnose.measured_points import compare_shapes, report_base_targets
 from loopcal.diagnose.model_discrepancy import find_dense_regions
 from loopcal.diagnose.outliers import find_outliers
 from loopcal.diagnose.residual_patterns import CAUSE, POSE, linearize_examined

@@ -27,7 +27,7 @@ from loopcal.apply.calibration_options import check_limit
 from loopcal.apply.conformity import Conformity, judge_limits, report_conformity
 from loopcal.diagnose.blunders import Blunder, Explanation, check_held_out_rows, name_blunders
 from loopcal.diagnose.conventions.convention_check import find_moved_setups
-from loopcal.diagnose.frame_drift import report_base_targets
+from loopcal.diagnose.measured_points import report_base_targets
 from loopcal.diagnose.row_errors import (
     KindErrors,
     NoiseFloor,

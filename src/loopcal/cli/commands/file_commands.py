@@ -345,7 +345,7 @@ def fill(
           --unit in -o measured.csv
     """
     from loopcal.diagnose.conventions.convention_check import check_conventions
-    from loopcal.diagnose.point_names import examine_points
+    from loopcal.diagnose.measured_points import examine_points
     from loopcal.io.exports.conversion import fill_sheet, save_converted
     from loopcal.io.exports.profile import find_profile_file, read_profile, with_local_settings
 

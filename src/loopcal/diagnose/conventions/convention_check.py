@@ -171,7 +171,7 @@ def compare_conventions(robot: Mechanism, data: Measurements) -> ConventionCheck
     robot : as given, before any fit: its values, and its tolerances (stated or default).
     data : as read. The `source` of its observations, such as a file, appears in the messages.
         Targets on the base are left out: they say nothing about the robot, and
-        `loopcal.diagnose.frame_drift.report_base_targets` compares them with each other.
+        `loopcal.diagnose.measured_points.report_base_targets` compares them with each other.
 
     Raises
     ------

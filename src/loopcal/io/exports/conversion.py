@@ -11,7 +11,8 @@ row has the time of its first line.
 
 The data sheet of a plan states poses, readings and the instrument. Points are joined with it by
 their names, or by their order: all targets of the first pose, then those of the second, and so on.
-Before it is written, the points are to be examined: `loopcal.diagnose.point_names.examine_points`.
+Before it is written, the points are to be examined:
+`loopcal.diagnose.measured_points.examine_points`.
 """
 
 from __future__ import annotations
