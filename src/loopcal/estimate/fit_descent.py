@@ -34,7 +34,6 @@ from loopcal.estimate.observation_rows import linked_blocks
 from loopcal.estimate.options import FitOptions
 from loopcal.estimate.penalties import HOLD, MAP, WEAKEST, LeastSquares, Method, Ridge
 from loopcal.estimate.posterior import NOISE
-from loopcal.estimate.prior import Prior
 from loopcal.estimate.prior_inflation import ROUNDS, choose_methods
 from loopcal.estimate.problem import Problem, make_exact_problem
 from loopcal.estimate.residual_test import SIGNIFICANCE
@@ -202,15 +201,35 @@ def fit_with_loss(
     options: FitOptions,
     progress: Progress = report_no_progress,
 ) -> tuple[Descent, FloatArray, Problem]:
-    """Descend with or without a loss; return also the weight (n,) of each pose and the problem with
-    these weights.
+    """Descend with or without a loss (then one trial); return also the weight (n,) of each pose and
+    the problem with these weights.
+
+    Where sigmas are only known up to a factor, it is the median of the blocks' distances.
     """
     run: Run = partial(fit_rows, options=options, progress=progress)
-    if options.loss is None:
-        return run(problem, z, None), np.ones(data.n_poses), problem
-    estimated, blocks = options.noise == "estimated", linked_blocks(data)
-    robust = descend_robustly(problem, blocks, options.loss, z, estimated, run, options.prior)
-    return robust.fit, robust.weight, robust.problem
+    fit = RobustFit(run(problem, z, None), problem, np.ones(data.n_poses))
+    if (loss := options.loss) is None:
+        return fit.fit, fit.weight, problem
+    member = np.unique(linked_blocks(data), return_inverse=True)[1]
+    is_estimated = options.noise == "estimated"
+    if fit.fit.status[0] not in (DescentStatus.CONVERGED, DescentStatus.BAD_START):
+        # one row that is far off can prevent every step: blocks far from the start, whose error the
+        # distance of the median block shows, are left out first
+        distance, degrees = measure_block_distances(problem, z, problem.start(z), member, problem)
+        weight = Tukey().weight(distance / estimate_scale_of(distance, degrees), degrees)[member]
+        weighted = problem.weighted(weight)
+        fit = RobustFit(run(weighted, z, None), weighted, weight)
+    if getattr(loss, "is_redescending", False):
+        coarse = 100.0 * CONVERGED_CHANGE
+        fit = _reweight(problem, member, Huber(), fit, is_estimated, run, coarse)
+    fit = _reweight(problem, member, loss, fit, is_estimated, run, CONVERGED_CHANGE)
+    if fit.problem is problem:
+        return fit.fit, fit.weight, problem
+    # the first cost is weighted as the last one, so that both compare
+    whole = fit.problem if options.prior is None else options.prior.added(fit.problem)
+    costs = fit.fit.cost_history.copy()
+    costs[0] = whole.linearize(z, fit.fit.start).cost
+    return replace(fit.fit, cost_history=costs), fit.weight, fit.problem
 
 
 def fit_with_tolerances(
@@ -381,43 +400,6 @@ class RobustFit:
     fit: Descent
     problem: Problem
     weight: FloatArray
-
-
-def descend_robustly(
-    problem: Problem,
-    block: IntArray,
-    loss: Loss,
-    deviation: FloatArray,
-    estimate_scale: bool,
-    run: Run,
-    prior: Prior | None = None,
-) -> RobustFit:
-    """Fit with a loss (one trial), blocks of poses numbered by `block` (n,).
-
-    Where sigmas are only known up to a factor (`estimate_scale`), it is the median of the blocks'
-    distances. `run` descends a problem, with the rows of the prior.
-    """
-    member = np.unique(block, return_inverse=True)[1]
-    fit = RobustFit(run(problem, deviation, None), problem, np.ones(len(block)))
-    if fit.fit.status[0] not in (DescentStatus.CONVERGED, DescentStatus.BAD_START):
-        # one row that is far off can prevent every step: blocks far from the start, whose error the
-        # distance of the median block shows, are left out first
-        start = problem.start(deviation)
-        distance, degrees = measure_block_distances(problem, deviation, start, member, problem)
-        weight = Tukey().weight(distance / estimate_scale_of(distance, degrees), degrees)[member]
-        weighted = problem.weighted(weight)
-        fit = RobustFit(run(weighted, deviation, None), weighted, weight)
-    if getattr(loss, "is_redescending", False):
-        coarse = 100.0 * CONVERGED_CHANGE
-        fit = _reweight(problem, member, Huber(), fit, estimate_scale, run, coarse)
-    fit = _reweight(problem, member, loss, fit, estimate_scale, run, CONVERGED_CHANGE)
-    if fit.problem is problem:
-        return fit
-    # the first cost is weighted as the last one, so that both compare
-    whole = fit.problem if prior is None else prior.added(fit.problem)
-    costs = fit.fit.cost_history.copy()
-    costs[0] = whole.linearize(deviation, fit.fit.start).cost
-    return replace(fit, fit=replace(fit.fit, cost_history=costs))
 
 
 def measure_block_distances(
