@@ -191,7 +191,7 @@ def test_covariance_by_correlated_errors_agrees_with_dense_generalized_least_squ
             covariances.append(total / nu * gain @ K @ gain.T)
     weight = np.exp(np.array(logs) - max(logs))
     expected = np.einsum("i,ijk->jk", weight / weight.sum(), np.array(covariances))
-    root = rows.root / TOLERANCE[:, None]
+    root = rows.root.machine / TOLERANCE[:, None]
     np.testing.assert_allclose(
         root @ errors.covariance @ root.T, expected, rtol=1e-4, atol=1e-6 * np.diag(expected).min()
     )
