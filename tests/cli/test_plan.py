@@ -224,7 +224,7 @@ def test_force_keeps_measured_values_and_files_of_the_user(loopcal, folder):
     assert (folder / "plan" / "notes.txt").read_text() == "leg 2 squeaks"
     (folder / "plan" / "notes.txt").unlink()
     document = json.loads((folder / "plan" / "plan.json").read_text())
-    del document["files"]  # of a plan that tells nothing of its files, a sheet may be filled in
+    del document["files"]  # such a folder is not one that loopcal wrote
     (folder / "plan" / "plan.json").write_text(json.dumps(document))
     loopcal(again, code=1)
     assert data.read_text() == empty

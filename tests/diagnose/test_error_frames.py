@@ -298,10 +298,10 @@ def test_frames_survive_the_run_folder():
     for frame in ("fitted", "tracker", "relative"):
         kept, restored = (pose_uncertainty(p, at, frame=frame).sd for p in (fit.posterior, back))
         assert np.array_equal(kept, restored)
-    older = {k: v for k, v in fit.arrays().items() if not k.startswith("frames_")}
-    from_older = pose_uncertainty(posterior_from_arrays(fit.robot, older), at)
+    without = {k: v for k, v in fit.arrays().items() if not k.startswith("frames_")}
+    of_home = pose_uncertainty(posterior_from_arrays(fit.robot, without), at)
     np.testing.assert_allclose(
-        from_older.position, pose_uncertainty(fit, at).position, rtol=0.2
+        of_home.position, pose_uncertainty(fit, at).position, rtol=0.2
     )  # poses about home in place of the measured ones
     with pytest.raises(
         EstimationError, match=r"frame is 'laser'.* must be one of 'fitted', .*'tracker'"

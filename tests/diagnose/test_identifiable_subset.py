@@ -37,7 +37,7 @@ def name_parameters(*letters: str) -> set[str]:
 
 
 def test_3_prs_with_fourteen_parameters_a_chain_drops_bz_thbz_and_thcy(load_with_line):
-    robot = load_with_line("3-prs", "parameters: fourteen")
+    robot = load_with_line("3-prs", "parameter_set: fourteen")
     result = identifiability(robot, tracker(), poses=36)
     assert (result.rank, result.n_parameters) == (33, 42)
     smaller = choose_identifiable_subset(result)
@@ -55,7 +55,7 @@ def test_3_prs_with_fourteen_parameters_a_chain_drops_bz_thbz_and_thcy(load_with
 
 def test_ru_pus_prs_with_27_parameters_merges_two_rotations(load_with_line):
     result = identifiability(
-        load_with_line("ru-pus-prs", "parameters: twenty-seven"), tracker(), poses=36
+        load_with_line("ru-pus-prs", "parameter_set: twenty-seven"), tracker(), poses=36
     )
     (merged,) = choose_identifiable_subset(result).dropped
     assert result.rank == 26

@@ -48,7 +48,7 @@ def test_known_frame_is_suggested_for_an_unknown_frame(unknown, datum):
 def test_joint_sensor_is_suggested_for_a_parameter_without_effect_on_poses(tmp_path):
     path = tmp_path / "robot.yaml"
     path.write_text(
-        list_shipped_robots()["3-prs"].read_text("utf-8") + "parameters: fourteen\n", "utf-8"
+        list_shipped_robots()["3-prs"].read_text("utf-8") + "parameter_set: fourteen\n", "utf-8"
     )
     result = {
         r.combination.names[0]: r

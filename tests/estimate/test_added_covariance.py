@@ -167,6 +167,4 @@ def test_a_run_folder_keeps_the_parts_of_the_covariance():
     for part, same in zip(added.posterior.parts, read.parts, strict=True):
         assert (part.source, part.degrees) == (same.source, same.degrees)
         np.testing.assert_array_equal(part.root, same.root)
-    older = {k: v for k, v in arrays.items() if not k.startswith("posterior_root")}
-    assert posterior_from_arrays(added.robot, older).parts == ()
     assert isinstance(read.parts[0], CovariancePart)
