@@ -559,10 +559,12 @@ class Bootstrap(TableResult):
         half = 0.5 * (linear[1] - linear[0])
         with np.errstate(divide="ignore", invalid="ignore"):
             shift, shift_error = (quantile - linear) / half, error / half
-        lower, upper = self._ends(kind, level, quantile)
         degrees = self.scatter.degrees if self.scheme != "normal" else np.inf
         widen = coverage_factor(degrees, level) / coverage_factor(np.inf, level)
-        linear = estimate + (linear - estimate) * (widen if kind == "widened" else 1.0)
+        if kind == "widened":
+            quantile, linear = (estimate + (ends - estimate) * widen for ends in (quantile, linear))
+        elif kind != "percentile":
+            quantile = self._find_ends(kind, level)
         return mask_intervals(
             self.is_known,
             self.fit.names,
@@ -570,7 +572,7 @@ class Bootstrap(TableResult):
             f"{self.scheme} bootstrap, {kind}",
             center=self.draws.mean(axis=0),
             sd=self.draws.std(axis=0, ddof=1),
-            **dict(zip(ENDS, (lower, upper, *linear), strict=True)),
+            **dict(zip(ENDS, (*quantile, *linear), strict=True)),
             shift=shift,
             shift_error=shift_error,
         )
@@ -593,30 +595,20 @@ class Bootstrap(TableResult):
         ratio = self.standard_deviations / stated
         return (*findings, self.scatter.report(self.fit.names, ratio, self.blocks))
 
-    def _ends(
-        self, kind: IntervalKind, level: float, quantile: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return the ends (p,) of intervals; `quantile` (2, p) are those of the resamples."""
+    def _find_ends(self, kind: IntervalKind, level: float) -> FloatArray:
+        """Return the ends (2, p) of intervals that are not those of the resamples."""
         estimate, tails = self.fit.estimate, np.array([0.5 - 0.5 * level, 0.5 + 0.5 * level])
-        if kind == "percentile" or (kind == "widened" and self.scheme == "normal"):
-            return quantile[0], quantile[1]
-        if kind == "widened":
-            factor = coverage_factor(self.scatter.degrees, level) / coverage_factor(np.inf, level)
-            return tuple(estimate + (quantile - estimate) * factor)
         if kind == "studentized":
             q = np.quantile((self.draws - estimate) / self.sd, tails, axis=0)
             own = self.scatter.noise * self.scatter.unit_sd
-            return estimate - q[1] * own, estimate - q[0] * own
+            return estimate - q[::-1] * own
         # bias-corrected: shifted by the share of resamples below the estimate
         from scipy.special import ndtr, ndtri
 
         share, least = (self.draws < estimate).mean(axis=0), 0.5 / len(self.draws)
         z = 2.0 * ndtri(np.clip(share, least, 1.0 - least)) + ndtri(tails)[:, None]
-        lower, upper = (
-            np.array([np.quantile(of_one, p) for of_one, p in zip(self.draws.T, row, strict=True)])
-            for row in ndtr(z)
-        )
-        return lower, upper
+        pairs = zip(self.draws.T, ndtr(z).T, strict=True)
+        return np.array([np.quantile(of_one, shares) for of_one, shares in pairs]).T
 
 
 def bootstrap(

@@ -19,7 +19,7 @@ give (A'WA)^-1 = (A'A)^-1 / mean w, for unit noise. See docs/theory/uncertainty.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -206,12 +206,32 @@ def fit_with_loss(
 
     Where sigmas are only known up to a factor, it is the median of the blocks' distances.
     """
-    run: Run = partial(fit_rows, options=options, progress=progress)
+    run = partial(fit_rows, options=options, progress=progress)
     fit = RobustFit(run(problem, z, None), problem, np.ones(data.n_poses))
     if (loss := options.loss) is None:
         return fit.fit, fit.weight, problem
     member = np.unique(linked_blocks(data), return_inverse=True)[1]
     is_estimated = options.noise == "estimated"
+
+    def reweight(robust: RobustFit, loss: Loss, change: float) -> RobustFit:
+        """Reweight until no weight changes by more than `change`."""
+        for _ in range(REWEIGHTINGS):
+            fit = robust.fit
+            if fit.status[0] != DescentStatus.CONVERGED:
+                break
+            distance, degrees = measure_block_distances(
+                problem, fit.deviation, fit.start, member, robust.problem
+            )
+            if is_estimated:
+                distance = distance / estimate_scale_of(distance, degrees)
+            weight = weigh_blocks(loss, distance, degrees)[member]
+            if float(np.abs(weight - robust.weight).max()) <= change:
+                break
+            weighted = problem.weighted(weight)
+            again = run(weighted, fit.deviation, fit.start).after(fit)
+            robust = RobustFit(again, weighted, weight)
+        return robust
+
     if fit.fit.status[0] not in (DescentStatus.CONVERGED, DescentStatus.BAD_START):
         # one row that is far off can prevent every step: blocks far from the start, whose error the
         # distance of the median block shows, are left out first
@@ -220,9 +240,8 @@ def fit_with_loss(
         weighted = problem.weighted(weight)
         fit = RobustFit(run(weighted, z, None), weighted, weight)
     if getattr(loss, "is_redescending", False):
-        coarse = 100.0 * CONVERGED_CHANGE
-        fit = _reweight(problem, member, Huber(), fit, is_estimated, run, coarse)
-    fit = _reweight(problem, member, loss, fit, is_estimated, run, CONVERGED_CHANGE)
+        fit = reweight(fit, Huber(), 100.0 * CONVERGED_CHANGE)
+    fit = reweight(fit, loss, CONVERGED_CHANGE)
     if fit.problem is problem:
         return fit.fit, fit.weight, problem
     # the first cost is weighted as the last one, so that both compare
@@ -383,9 +402,6 @@ CONVERGED_CHANGE = 1e-4
 """Largest change of a weight at which the weights have converged; a hundred times that where they
 only begin another loss."""
 
-Run = Callable[[Problem, FloatArray, Start | None], Descent]
-"""Descends a problem from a deviation and a warm start."""
-
 
 @dataclass(frozen=True, eq=False)
 class RobustFit:
@@ -431,34 +447,6 @@ def estimate_scale_of(distance: FloatArray, degrees: FloatArray) -> float:
     ratio = distance[is_tested] / np.sqrt(compute_chi_square_quantile(degrees[is_tested], 0.5))
     middle = compute_median(ratio) if len(ratio) else 1.0
     return middle if middle > 0.0 else 1.0
-
-
-def _reweight(
-    problem: Problem,
-    member: IntArray,
-    loss: Loss,
-    robust: RobustFit,
-    estimate_scale: bool,
-    run: Run,
-    change: float,
-) -> RobustFit:
-    """Reweight until no weight changes by more than `change`."""
-    for _ in range(REWEIGHTINGS):
-        fit = robust.fit
-        if fit.status[0] != DescentStatus.CONVERGED:
-            break
-        distance, degrees = measure_block_distances(
-            problem, fit.deviation, fit.start, member, robust.problem
-        )
-        if estimate_scale:
-            distance = distance / estimate_scale_of(distance, degrees)
-        weight = weigh_blocks(loss, distance, degrees)[member]
-        if float(np.abs(weight - robust.weight).max()) <= change:
-            break
-        weighted = problem.weighted(weight)
-        again = run(weighted, fit.deviation, fit.start).after(fit)
-        robust = RobustFit(again, weighted, weight)
-    return robust
 
 
 NUDGE = 1e-4
