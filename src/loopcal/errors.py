@@ -18,8 +18,7 @@ from loopcal.plain_text import escape
 if TYPE_CHECKING:
     from loopcal.findings import Finding
 
-MOST_NAMES = 2000
-"""Names that are compared with a wrong one, which takes some microseconds each."""
+MOST_NAMES = 2000  # names that are compared with a wrong one, which takes some microseconds each
 
 
 class LoopcalError(Exception):

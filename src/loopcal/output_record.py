@@ -11,8 +11,8 @@ from pathlib import Path
 Identity = tuple[int, int]
 """Device and number by which an operating system knows a file or folder, whatever its name."""
 
+# Path as the user wrote it, its target, and the identity of what was to take its name.
 _RECORD: ContextVar[list[tuple[Path, Path, Identity]] | None] = ContextVar("record", default=None)
-"""Path as the user wrote it, its target, and the identity of what was to take its name."""
 
 
 @contextmanager

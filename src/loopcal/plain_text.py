@@ -14,8 +14,7 @@ import re
 import unicodedata
 from typing import Any
 
-SHOWN = 40
-"""Characters of another's text that a message quotes."""
+SHOWN = 40  # characters of another's text that a message quotes
 
 _NOT_PLAIN = re.compile(
     "["

@@ -11,8 +11,7 @@ from typing import Any
 
 from loopcal.plain_text import escape
 
-INTERVAL = 0.2
-"""Seconds between two updates of a bar."""
+INTERVAL = 0.2  # seconds between two updates of a bar
 
 
 class ProgressBar:

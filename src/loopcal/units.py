@@ -43,14 +43,13 @@ class Dimension(Enum):
         return Dimension(f"{self.value} per {other.value}")
 
 
-LARGEST = 1e9
-"""Largest number of a file [m, rad, 1]: beyond it, squares and cubes lose all meaning."""
+LARGEST = 1e9  # largest number of a file [m, rad, 1]: beyond it, squares and cubes lose all meaning
+# Smallest standard deviation above zero [m, rad, 1]: the size of an atom's nucleus.
 SMALLEST_SD = 1e-15
-"""Smallest standard deviation above zero [m, rad, 1]: the size of an atom's nucleus."""
 ABSOLUTE_ZERO, ROUNDING = -273.15, 1e-9
 """Lowest temperature, and the rounding of a conversion that is accepted below it [degC]."""
+# The allowed standard deviations, for messages.
 SD_RANGE = f"from {SMALLEST_SD:g} to {LARGEST:g} m, rad or 1"
-"""The allowed standard deviations, for messages."""
 
 Length = Annotated[float, Dimension.LENGTH]
 Angle = Annotated[float, Dimension.ANGLE]
@@ -118,13 +117,13 @@ UNITS: dict[str, Unit] = {
         Unit("kNm", Dimension.MOMENT, 1e3),
     )
 }
+# What slopes are per unit of -> the units of these slopes in SI.
 SLOPES: dict[str, tuple[str, ...]] = {
     "degC": ("m", "rad"),
     "s": ("m", "rad"),
     "N": ("m",),
     "Nm": ("rad",),
 }
-"""What slopes are per unit of -> the units of these slopes in SI."""
 
 
 def _make_slope(of: str, by: str) -> Unit:
@@ -228,10 +227,10 @@ def find_unit(symbol: str, dimension: Dimension | None = None) -> Unit:
     return known
 
 
+# A number of a file. Python also reads `1_000` and digits of other alphabets.
 NUMBER = re.compile(
     r"[+-]?(?:(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?|inf(?:inity)?|nan)", re.ASCII | re.IGNORECASE
 )
-"""A number of a file. Python also reads `1_000` and digits of other alphabets."""
 
 
 def parse_number(text: str) -> float | None:
