@@ -47,6 +47,13 @@ def test_motions_of_both_frames_are_stated_and_undone(base, platform, frames) ->
     assert find_base_motion(robot, kept, False, frames) == (None, None)
 
 
+def test_a_shift_turns_nothing() -> None:
+    moved, robot = move_frames(make_pose(np.eye(3), SHIFT), np.eye(4)), lc.load_robot("hexapod-42")
+    finding, _ = find_base_motion(robot, moved, False, ("base",))
+    assert finding is not None
+    assert finding.data["base_turn"].value == 0.0
+
+
 def test_a_frame_that_was_measured_is_not_taken_for_a_convention() -> None:
     moved, robot = move_frames(F, np.eye(4)), lc.load_robot("hexapod-42")
     assert find_base_motion(robot, moved, False, ()) == (None, None)

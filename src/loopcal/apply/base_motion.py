@@ -117,6 +117,7 @@ def find_base_motion(
     sizes: dict[str, Any] = {"keeps": keeps, "frames": [*compress(FRAMES, allowed[[3, 9]])]}
     for frame, F in zip(FRAMES, (M, P), strict=True):
         angle, length = (float(np.linalg.norm(v)) for v in (log_so3(F[:3, :3]), F[:3, 3]))
+        angle *= angle > ROUNDING
         is_moved = angle * robot.size + length > ROUNDING * robot.size
         sizes[f"{frame}_turn"] = Quantity(math.degrees(angle), "deg") if is_moved else 0
         sizes[f"{frame}_shift"] = Quantity(1e3 * length, "mm") if is_moved else 0

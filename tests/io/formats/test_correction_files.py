@@ -13,6 +13,8 @@ import loopcal as lc
 from loopcal.apply.compensation import TableSize, make_tables
 from loopcal.cli.entry_point import main
 from loopcal.documents import list_controllers
+from loopcal.findings import report_finding
+from loopcal.findings.catalog import load_catalog
 from loopcal.geometry import align_point_sets
 from loopcal.io.formats import FORMATS
 from loopcal.io.formats.program_format import Exported, ExportSource
@@ -163,6 +165,17 @@ def test_the_command_writes_tables_and_keeps_files(tmp_path: Path, capsys) -> No
     assert printed.out.startswith("x [mm],y [mm],z [mm],add x [mm]")
     assert main([*command, "csv", "--table-error", "2um"]) == 1
     assert main([*command, "grid-reprap", "--into", str(tmp_path / "joints.ini"), "-o", "x"]) == 1
+
+
+def test_only_tables_of_all_coordinates_move_programs(tmp_path: Path, capsys, monkeypatch) -> None:
+    lc.save_robot(disturb(lc.load_robot("linear-delta")), tmp_path / "true.yaml")
+    moves = report_finding("files.base-moves", **load_catalog()["files.base-moves"].example)
+    chosen = "loopcal.apply.base_motion.choose_base"
+    monkeypatch.setattr(chosen, lambda result, old, robot, **settings: (robot, (moves,)))
+    command = ["export", str(tmp_path / "true.yaml"), "--controller", "linear-delta", "--format"]
+    for name, is_said in (("grid", True), ("grid-klipper", False), ("klipper-skew", False)):
+        assert main([*command, name]) == 0
+        assert ("of a program" in " ".join(capsys.readouterr().err.split())) == is_said
 
 
 def test_reports_list_no_tables(machine: Pair) -> None:

@@ -715,7 +715,9 @@ def export(
     if target.table is not None:
         tables, noted = make_tables(robot, old, TableSize(*target.table), table_error)
         stem = target.name if output is None else output.stem
-        loaded, moved = replace(loaded, tables=tables, stem=stem), (*moved, noted)
+        loaded = replace(loaded, tables=tables, stem=stem)
+        is_whole = TableSize(*target.table).what in ("commands", "readings")
+        moved = (*moved, noted) if is_whole else (noted,)  # heights and skews move no program
     loaded = replace(loaded, is_for_people=output is None, findings=moved)
     exported = export_robot(loaded, target, into)
     written: dict[Path, str] = {}
