@@ -85,7 +85,7 @@ def test_a_session_becomes_the_input_of_a_calibration(measure, rows, loopcal) ->
 def test_the_suggested_pose_needs_no_name(measure, rows) -> None:
     values = {row[0]: row[1:] for row in rows}
     first = measure([]).words.partition("Command pose ")[2].partition(":")[0]
-    measure([join(values[first])])
+    measure([join(values[first])], "session: 1 row, 1 used")
     assert read_used() == [first]
 
 

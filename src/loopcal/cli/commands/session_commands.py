@@ -70,6 +70,7 @@ def measure(
       loopcal measure plan -o session --follow points.txt --profile leica
     """
     from loopcal.cli.measuring_dialog import Dialog
+    from loopcal.findings.wording import name_count
     from loopcal.io.data.measurement_file import has_empty_readings, load_instrument_to_plan
     from loopcal.io.exports.conversion import read_sheet
     from loopcal.io.exports.growing_export import GrowingExport
@@ -123,7 +124,7 @@ def measure(
         "used": used,
         "findings": dialog.progress,
     }
-    page = [f"{output}: {len(visits)} rows, {used} used"]
+    page = [f"{output}: {name_count(len(visits), 'row')}, {used} used"]
     if used:
         page.append(suggest_command("calibrate", robot, data, "-o", "run"))
     return Output(document, lambda: page)
