@@ -61,8 +61,8 @@ def test_a_stated_value_is_finite(value):
         (lambda fit, data: lc.sample_truth(fit.robot, 1, -1), "seed is -1. Give"),
         (lambda fit, data: lc.identifiability(fit.robot, data, 2.0), "rank_tolerance is 2.0"),
         (lambda fit, data: lc.sample_workspace(lc.load_robot("five-bar"), -1), "-1 positions"),
-        (lambda fit, data: lc.find_outliers(fit, hexapod_data(9)), "9 poses, .* made from 12"),
-        (lambda fit, data: lc.examine_fit(fit, hexapod_data(9)), "9 poses, .* made from 12"),
+        (lambda fit, data: lc.find_outliers(fit, hexapod_data(9)), "9 poses, but the fit has 12"),
+        (lambda fit, data: lc.examine_fit(fit, hexapod_data(9)), "9 poses, but the fit has 12"),
         (lambda fit, data: lc.compute_joint_region(fit, combinations=np.zeros((1, 42))), "zeros"),
         (
             lambda fit, data: lc.compute_joint_region(fit, combinations=np.full((1, 42), np.inf)),

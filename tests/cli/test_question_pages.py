@@ -115,7 +115,7 @@ def test_page_of_poses_is_true_of_the_evidence(root) -> None:
                 find_median(f"{few} planned", noise)[0] / find_median(f"{many} planned", noise)[0]
             )
             assert 1.8 < ratio < 2.2  # four times as many poses halve it
-    assert "without motions of frames" in document["frame"]
+    assert "exclude motions of frames" in document["frame"]
 
 
 def test_page_of_methods_is_true_of_the_evidence(root) -> None:

@@ -356,7 +356,7 @@ def test_missing_rows_missing_parameters_and_unknown_noise_are_refused(data):
     fixed = replace(hexapod(), parameters=hexapod().parameters.with_free([]))
     with expect_refusal("fit.no-free-parameter", total=42):
         identify(fixed, data, LeastSquares())
-    with pytest.raises(EstimationError, match="'given' or 'estimated'"):
+    with pytest.raises(EstimationError, match="must be one of 'given', 'estimated'"):
         identify(hexapod(), data, LeastSquares(), options=FitOptions(noise="guessed"))  # pyright: ignore[reportArgumentType]
 
 

@@ -24,6 +24,8 @@ USES_LIBRARY = {
     "studies/study_result.py": "writes a long table row by row, and makes one in memory",
     "studies/files/store.py": "writes the files of a new folder",
     "cli/commands/calibration_commands.py": "makes a table in memory",
+    "io/formats/correction_files.py": "makes tables in memory",
+    "io/runs/session_folder.py": "appends rows that are on the disk before the next",
     "io/runs/run_folder.py": "makes arrays.npz in memory",
     "report/pictures.py": "draws into memory",
 }

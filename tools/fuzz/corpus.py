@@ -152,7 +152,9 @@ def work_in_folder(name: str) -> Iterator[str]:
 def _build_machine(recipe: Recipe) -> Machine:
     """Make a robot, its data, its run and its plan, and the lines that use them."""
     name = recipe.robot
-    machine = Machine(name, words=[*recipe.words.split(), "a", "1", "2", "fitted", "base", name])
+    words = [*recipe.words.split(), "a", "1", "2", "fitted", "base", name]
+    # a followed export is waited for
+    machine = Machine(name, words=words, left_out=frozenset({"--follow"}))
     with work_in_folder(name):
         shutil.copy(ROOT / "src" / "loopcal" / "robots" / f"{name}.yaml", "robot.yaml")
         seen = f"simulate robot.yaml --draw-errors {recipe.instrument}"
@@ -241,6 +243,9 @@ def _list_lines(recipe: Recipe) -> Iterator[Line]:
         0.3 view run -o out.html --no-browser --json
         1 compare run later
         0.5 compare run later --data more.csv --json
+        1 check-up run more.csv
+        0.5 check-up run more.csv data.csv -o out.svg
+        0.5 measure {sheet} --robot robot.yaml -o out
         1 repeatability robot.yaml data.csv
         1 certificate run facts.yaml
         1 accuracy run --volume {volume}

@@ -130,8 +130,10 @@ def compare_coordinates(
         angle = geometry.matrix_to_tilt_torsion(rotation)[..., 2]
         residual[:, place] = size * geometry.wrap_angle(angle - wanted["psi"])
         # d psi = (ez + n) . omega / (1 + cos theta): orthogonal to the axes that phi and theta turn
-        # about
-        columns[:, place, :3] = size * ((normal + np.eye(3)[2]) / (1.0 + normal[:, 2:]))
+        # about. Upside down torsion has no meaning, and no slope
+        left = 1.0 + normal[:, 2:]
+        inverse = np.divide(size, left, out=np.zeros_like(left), where=left > 0.0)
+        columns[:, place, :3] = (normal + np.eye(3)[2]) * inverse
     if set(EULER) & set(names):
         angles = geometry.matrix_to_euler(rotation, "xyz")
         rates = geometry.euler_rates_inverse(angles, "xyz")
