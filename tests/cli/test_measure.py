@@ -341,6 +341,7 @@ def test_a_session_in_a_terminal_of_80_columns(rows) -> None:
     subprocess.run([*tmux, "new-session", "-d", "-x", "80", "-y", "24", words], check=True)
 
     def wait_for(text: str) -> str:
+        screen = ""
         for _ in range(100):
             screen = subprocess.run(
                 [*tmux, "capture-pane", "-p"], capture_output=True, text=True, check=True

@@ -8,6 +8,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
@@ -27,13 +28,13 @@ from loopcal.planning.pose_planning import plan
 SIGMA = 5e-6
 # Place of an instrument whose frame is unknown [m].
 PLACE = geometry.make_pose(geometry.exp_so3(np.array([1.1, -0.6, 2.2])), np.array([2.5, -1.3, 0.7]))
-Wrong = Mapping[int, Sequence[float]]
+Wrong = Mapping[int, Any]
 
 
 class Machine:
     """A plan for a robot, and a true machine whose poses are measured as often as one likes."""
 
-    def __init__(self, name: str, frames: tuple[str, ...], seed: int, **options: float) -> None:
+    def __init__(self, name: str, frames: tuple[str, ...], seed: int, **options: Any) -> None:
         self.robot, self.is_framed = lc.load_robot(name), bool(frames)
         description = InstrumentDescription(
             ("position",), sigma_position=SIGMA, unknown_frames=frames
@@ -184,7 +185,7 @@ def test_rows_on_one_line_and_repeated_points_leave_a_far_frame_open_but_fit() -
 def test_a_wrong_row_before_anything_could_be_tested_is_found_later() -> None:
     """Without an earlier judgement, a wrong first row makes right rows doubtful."""
     machine, wrong = make_machine(("base",)), {0: (3e-4, -3e-4, 3e-4)}
-    poses, state = [machine.fit[0]], co.Companion(machine.task)
+    poses, state, verdict = [machine.fit[0]], co.Companion(machine.task), None
     for _ in range(12):
         measured = machine.measure(poses, wrong)
         verdict = co.examine_row(state, measured, poses[-1])
@@ -193,13 +194,14 @@ def test_a_wrong_row_before_anything_could_be_tested_is_found_later() -> None:
             break
         pending = state.pending
         poses.append(pending[-1] if pending else next(i for i in machine.fit if i not in poses))
+    assert verdict is not None
     assert verdict.judgement == "earlier-wrong"
     assert machine.task.labels[machine.fit[0]] in verdict.findings[0].data["suspects"]
 
 
 def test_a_check_pose_tells_a_drift() -> None:
     machine = make_machine()
-    drift = dict.fromkeys((10, 11), (8e-05, 0.0, 0.0))
+    drift: Wrong = {10: (8e-05, 0.0, 0.0), 11: (8e-05, 0.0, 0.0)}
     poses = [*machine.fit[:10], machine.fit[0], machine.fit[0]]
     verdicts = follow(machine, poses, drift)[1]
     assert [verdict.judgement for verdict in verdicts[10:]] == ["repeat", "moved"]
