@@ -48,14 +48,6 @@ def test_json_is_what_the_run_folder_holds(loopcal, run):
     assert total**0.5 == pytest.approx(stored["parameters"][worst], rel=1e-9)
 
 
-def test_a_run_of_an_earlier_version_is_refused_with_what_to_do(loopcal, run):
-    path = run / "result.json"
-    content = json.loads(path.read_text())
-    del content["expected_error"]["sources"]
-    path.write_text(json.dumps(content))
-    loopcal(f"budget {run}", "the uncertainty budget of", code=1)
-
-
 def test_the_largest_error_in_a_volume_is_stated_for_all_points_and_for_each(loopcal, run, capsys):
     volume = "--volume x=-20mm..20mm --volume y=-20mm..20mm"
     loopcal(f"accuracy {run} {volume}", "simultaneously at all points", "pointwise, 95 %")

@@ -582,7 +582,8 @@ class CalibrationReport(DeferredFields, TableResult):
             + (f" The limit of {' and '.join(missed)} fails." if missed else "")
         )
 
-    __repr__ = TableResult.__str__
+    def __repr__(self) -> str:
+        return str(self)
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Return arrays to store [SI]: those of the fit, the `initial` values of all parameters,

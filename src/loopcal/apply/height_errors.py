@@ -138,7 +138,8 @@ class HeightErrors(DrawnResult):
             if (self.is_held_out == is_held_out).any():
                 yield name, is_held_out
 
-    __repr__ = DrawnResult.__str__
+    def __repr__(self) -> str:
+        return str(self)
 
 
 def map_height_errors(

@@ -169,7 +169,8 @@ class RunComparison(DrawnResult):
         answers = [pair.moved for pair in self.pairs if pair.moved is not None]
         return any(answers) if answers else None
 
-    __repr__ = DrawnResult.__str__
+    def __repr__(self) -> str:
+        return str(self)
 
 
 def compare_runs(runs: Sequence[Run], data: Measurements | None = None) -> RunComparison:

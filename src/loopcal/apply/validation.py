@@ -277,7 +277,8 @@ class Validation(DrawnResult):
             )
         ]
 
-    __repr__ = DrawnResult.__str__
+    def __repr__(self) -> str:
+        return str(self)
 
     @property
     def checked(self) -> Validation:

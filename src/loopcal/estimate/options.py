@@ -98,7 +98,7 @@ class FitOptions(Limited):
     excluded_poses: Sequence[str] = ()
     nuisance: NuisanceParameters | None = None
 
-    ERROR = EstimationError
+    ERROR: ClassVar[type[Exception]] = EstimationError
     LIMITS: ClassVar[Mapping[str, Limit]] = {
         "sigma_uncertainty": Limit(
             lambda value: 0.0 <= value <= 1.0, "from 0 (the given sigmas are exact) to 1"

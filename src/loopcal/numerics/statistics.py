@@ -34,17 +34,26 @@ def _distribution(name: str) -> Distribution:
     return evaluate
 
 
-normal_probability = _distribution("ndtr")  # of at most x
-normal_quantile = _distribution("ndtri")  # value that is not exceeded with a probability
-chi_square_tail = _distribution("chdtrc")  # probability of more than x with k degrees of freedom
+# of at most x
+normal_probability: Distribution = _distribution("ndtr")
+# value that is not exceeded with a probability
+normal_quantile: Distribution = _distribution("ndtri")
+# probability of more than x with k degrees of freedom
+chi_square_tail: Distribution = _distribution("chdtrc")
 # value that chi-square of k degrees of freedom exceeds with a probability
-compute_chi_square_quantile = _distribution("chdtri")
-f_tail = _distribution("fdtrc")  # probability of more than x with k and `left` degrees of freedom
-f_quantile = _distribution("fdtri")  # value that is not exceeded with a probability
-student_probability = _distribution("stdtr")  # of at most t with some degrees of freedom
-student_quantile = _distribution("stdtrit")  # value of t that is not exceeded with a probability
-beta_probability = _distribution("betainc")  # of at most x, of the parameters a and b
-binomial_tail = _distribution("bdtrc")  # probability of more than k of n trials
+compute_chi_square_quantile: Distribution = _distribution("chdtri")
+# probability of more than x with k and `left` degrees of freedom
+f_tail: Distribution = _distribution("fdtrc")
+# value that is not exceeded with a probability
+f_quantile: Distribution = _distribution("fdtri")
+# of at most t with some degrees of freedom
+student_probability: Distribution = _distribution("stdtr")
+# value of t that is not exceeded with a probability
+student_quantile: Distribution = _distribution("stdtrit")
+# of at most x, of the parameters a and b
+beta_probability: Distribution = _distribution("betainc")
+# probability of more than k of n trials
+binomial_tail: Distribution = _distribution("bdtrc")
 
 
 def compute_chi_square_tail(degrees: ArrayLike, statistic: ArrayLike) -> FloatArray:

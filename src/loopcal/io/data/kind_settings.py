@@ -593,7 +593,11 @@ class PermissibleError:
 
 
 # Setting -> record of what scales lengths.
-SCALED = {"scale": Scale, "temperature": PartTemperature, MPE: PermissibleError}
+SCALED: Mapping[str, type[Any]] = {
+    "scale": Scale,
+    "temperature": PartTemperature,
+    MPE: PermissibleError,
+}
 ITEMS: Mapping[str, str] = {"session_bias": "bias", "session_drift": "drift"}
 
 

@@ -413,14 +413,14 @@ class ToleranceRecord:
 class LengthTolerance(ToleranceRecord):
     """Tolerance of a length: sd, or limits of a uniform error (sd = limits / sqrt 3)."""
 
-    GIVEN = Dimension.LENGTH
+    GIVEN: ClassVar[Dimension] = Dimension.LENGTH
 
 
 @dataclass(frozen=True)
 class AngleTolerance(ToleranceRecord):
     """Tolerance of an angle: sd, or limits of a uniform error (sd = limits / sqrt 3)."""
 
-    GIVEN = Dimension.ANGLE
+    GIVEN: ClassVar[Dimension] = Dimension.ANGLE
 
 
 @dataclass(frozen=True)

@@ -97,7 +97,7 @@ class NamedLength(NamedRecord):
     where a nominal value above zero is mapped onto a rod's length, a lead or a gain.
     """
 
-    GIVEN = Dimension.LENGTH
+    GIVEN: ClassVar[Dimension] = Dimension.LENGTH
 
     length: Length
     maps: tuple[MapEntry, ...]
@@ -109,7 +109,7 @@ class NamedLength(NamedRecord):
 class NamedAngle(NamedRecord):
     """A named parameter that is an angle, with its nominal value."""
 
-    GIVEN = Dimension.ANGLE
+    GIVEN: ClassVar[Dimension] = Dimension.ANGLE
 
     angle: Angle
     maps: tuple[MapEntry, ...]
