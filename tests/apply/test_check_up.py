@@ -157,7 +157,10 @@ def test_planned_checks_run_from_the_command_line(tmp_path, monkeypatch, capsys)
     call(f"{draw} --draw 20 --truth true.yaml -o data.csv --seed 4")
     call("calibrate linear-delta data.csv -o run --hold-out 0.25")
     plan = "plan run/robot.yaml --check-up --kind position"
-    assert "loopcal check-up RUN check/measurements.csv" in call(f"{plan} -o check")
+    page = call(f"{plan} -o check")
+    assert "5 poses of linear-delta for a check-up" in page
+    assert "validation" not in page
+    assert "loopcal check-up RUN check/measurements.csv" in page
     call("simulate true.yaml --fill check/measurements.csv -o week-1.csv --seed 6")
     assert "still holds" in call("check-up run week-1.csv -o history.svg")
     assert Path("history.svg").stat().st_size > 1000

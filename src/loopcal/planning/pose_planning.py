@@ -200,24 +200,21 @@ class Plan(DrawnResult):
         curve = () if self.curve is None else (self.curve.report(self.robot),)
         assert poses.path_length is not None, "a plan has a path"
         efficiency = self.quality.efficiency
+        what: dict[str, Any] = {"robot": self.robot.name, "poses": len(poses)}
+        what["kinds"] = tuple(
+            f"{kind.name} of targets on the base" if kind.is_of_base else kind.name
+            for kind in (sensor.kind for sensor in self.instrument.sensors)
+        )
+        path = report_finding(
+            "plan.path", length=Quantity(poses.path_length, "m"), via_home=int(poses.via_home.sum())
+        )
+        if self.options.allow_fewer_equations:
+            return (report_finding("plan.check", **what), path)
+        held_out = len(poses.groups) - self.n_groups
+        counts: dict[str, Any] = {"counted": counted, "fitted": self.n_groups, "held_out": held_out}
         return (
-            report_finding(
-                "plan.poses",
-                robot=self.robot.name,
-                poses=len(poses),
-                counted=counted,
-                fitted=self.n_groups,
-                held_out=len(poses.groups) - self.n_groups,
-                kinds=tuple(
-                    f"{kind.name} of targets on the base" if kind.is_of_base else kind.name
-                    for kind in (sensor.kind for sensor in self.instrument.sensors)
-                ),
-            ),
-            report_finding(
-                "plan.path",
-                length=Quantity(poses.path_length, "m"),
-                via_home=int(poses.via_home.sum()),
-            ),
+            report_finding("plan.poses", **what, **counts),
+            path,
             report_finding(
                 "plan.weak-certificate" if efficiency < WEAK else "plan.certificate",
                 shortfall=round_shortfall(efficiency),
