@@ -104,11 +104,11 @@ def test_a_wrong_row_is_left_out_and_its_repeat_used(measure, rows) -> None:
 
 @pytest.mark.slow
 def test_a_row_is_taken_back_used_and_left_out(measure, rows) -> None:
-    measure([*map(join, rows[:3]), "back"])
+    measure([*map(join, rows[:3]), "back"], f"the row of pose {rows[2][0]} is taken back")
     assert read_used() == [row[0] for row in rows[:2]]
     measure(["out"], "resumed with 2 rows, 2 of them in use")
     assert read_used() == [rows[0][0]]
-    measure(["keep"])
+    measure(["keep"], f"loopcal uses the row of pose {rows[1][0]}")
     assert read_used() == [row[0] for row in rows[:2]]
     measure(["back", "back", "back"], "the session has no row")
     assert not Path("session/measurements.csv").exists()

@@ -196,7 +196,9 @@ class Dialog:
             self.say(report_finding("session.nothing-to-take-back"))
             return False
         events = {"back": TAKEN_BACK, "keep": USED, "out": LEFT_OUT}
-        self.journal.decide(events[word], self.journal.visits[-1].number)
+        last = self.journal.visits[-1]
+        self.journal.decide(events[word], last.number)
+        self.say(report_finding("session.row-decided", word=word, pose=last.pose))
         self.state = self._restore(self.journal.visits)
         self._write()
         return True
