@@ -212,3 +212,9 @@ def test_what_fits_into_a_line_is_in_one_line() -> None:
         "a: {name: y, place: [0.1, 0.0]}     # one\nb:\n" + 7 * "  - {name: y, place: [0.1, 0.0]}\n"
     )
     assert format_yaml({"a": row, "b": [row] * 7}, {"a": "one"}) == text
+
+
+@pytest.mark.parametrize("merged", ["5", "text", "[1, {c: 1}]", "[[{c: 1}]]", "~", "2026-01-01"])
+def test_a_merge_of_what_is_no_mapping_is_refused_at_its_line(merged: str) -> None:
+    with pytest.raises(FileError, match=r"robot\.yaml:2: <<"):
+        parse(f"a: 1\nb: {{<<: {merged}, d: 2}}\n")

@@ -250,6 +250,8 @@ class _NodeReader:
             if name.tag.endswith(":merge"):
                 value = self.read(node, at, line)
                 merged += value if isinstance(value, list) else [value]
+                if not all(isinstance(other, dict) for other in merged):
+                    raise _RefusedError("<< merges no mapping. Write a mapping or its alias", line)
                 continue
             key = self.read(name, at, line)
             if not isinstance(key, str):
