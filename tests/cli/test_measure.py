@@ -102,6 +102,12 @@ def test_a_wrong_row_is_left_out_and_its_repeat_used(measure, rows) -> None:
     assert wrong(rows[6]).split()[1] in journal  # what was measured is not lost
 
 
+def test_a_wrong_row_that_is_pasted_twice_confirms_nothing(measure, rows) -> None:
+    given = [*map(join, rows[:6]), wrong(rows[6]), wrong(rows[6]), join(rows[6])]
+    measure(given, "repeats the doubted row", "Its earlier row was wrong")
+    assert Path("session/rows.csv").read_text().count(wrong(rows[6]).split()[1]) == 1
+
+
 @pytest.mark.slow
 def test_a_row_is_taken_back_used_and_left_out(measure, rows) -> None:
     measure([*map(join, rows[:3]), "back"], f"the row of pose {rows[2][0]} is taken back")

@@ -162,8 +162,11 @@ class Dialog:
         if not any(cells.values()):
             self.say(report_finding("session.no-value"))
             return False
-        is_known = name and any(v.pose == label and v.cells == cells for v in journal.visits)
-        if is_known and self.export is not None:
+        equal = [v for v in journal.visits if v.pose == label and v.cells == cells]
+        if self.export is None and any(v.is_used is False for v in equal):
+            self.say(report_finding("session.row-copied", pose=label))
+            return False
+        if name and equal and self.export is not None:
             self.say(report_finding("session.row-identical", pose=label))
             return False
         journal.measure(label, cells)
