@@ -189,6 +189,15 @@ def test_missing_unknown_and_repeated_points_are_listed(robot, sheet, points, tm
     assert f"{points[6][1][0] + 0.012:.6f}" in rows[1]
 
 
+@pytest.mark.parametrize("end", [b"\r\n", b"\r\r\n"])
+def test_settings_stay_whole_whatever_ends_the_lines(end, robot, sheet, points, tmp_path) -> None:
+    sheet.write_bytes(sheet.read_bytes().replace(b"\n", end))
+    filled = fill(robot, sheet, write_spatial_analyzer(tmp_path / "e.txt", points))
+    (tmp_path / "out.csv").write_text(filled.text)
+    data = load_measurements(tmp_path / "out.csv", robot, allow_outside_stroke=True)
+    assert data.n_poses == N
+
+
 @pytest.mark.parametrize("by_order", [False, True])
 def test_a_growing_export_gives_complete_sets_of_targets_once(
     robot, sheet, points, tmp_path, by_order

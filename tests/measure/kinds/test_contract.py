@@ -309,6 +309,19 @@ def test_kind_without_a_tool_is_refused_and_keeps_the_first_tool(kind):
     assert once.with_tool(np.eye(4)) is once
 
 
+@every_kind_with_columns
+def test_no_row_has_no_residual(kind):
+    kind = attach_frame_and_tool(kind)
+    T = platform_poses(kind, 1, 2)
+    measured, joints = measure_with_errors(kind, T, 1e-4)[0], draw_joint_values(kind, T)
+    none = [None if x is None else x[:, :0] for x in (T, measured, joints)]
+    values = draw_nuisance_values(kind)
+    found = kind.evaluate(none[0], none[1], None if values is None else values[:1], none[2])
+    whole = kind.evaluate(T, measured, None if values is None else values[:1], joints)
+    assert found.residual.shape == whole.residual[:1, :0].shape
+    assert found.jacobian.shape[1:] == whole.jacobian[:, :0].shape[1:]
+
+
 @every_kind
 def test_arrays_of_a_kind_are_read_only(kind):
     for value in vars(kind.with_tool(T_PLATFORM_TOOL)).values():

@@ -607,7 +607,8 @@ def format_rows(
     table: Table, body: Sequence[Row], header: Mapping[str, str | None]
 ) -> tuple[str, tuple[tuple[str, ...], ...]]:
     """Return the measurement file of rows with the settings of a sheet: its text, and its cells."""
-    above = read_text(table.path, "sheet").lstrip("\ufeff").splitlines()[: table.header_line - 1]
+    text = read_text(table.path, "sheet").lstrip("\ufeff")  # whose lines end as those of a table
+    above = (line.rstrip("\r") for line in text.split("\n")[: table.header_line - 1])
     lines = [line for line in above if line.strip()]
     cells = tuple(tuple(row.get(name, "") for name in header) for row in body)
     written = (format_header(header), *cells)

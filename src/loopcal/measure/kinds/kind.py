@@ -652,24 +652,25 @@ class Kind(ABC):
         """
         k, (t, r, c) = len(places), measured.columns.shape
         columns = measured.columns.reshape(t, r * k, c // k)
-        present = measured.present.reshape(len(measured.present), r * k, -1)
+        present = measured.present.reshape(len(measured.present), r * k, c // k)
         reference = kind._compute_reference(columns)
         own = values[..., places]
-        own = np.broadcast_to(own, (len(own), r, *own.shape[2:])).reshape(len(own), r * k, -1)
+        own = np.broadcast_to(own, (len(own), r, *own.shape[2:]))
+        own = own.reshape(len(own), r * k, own.shape[-1])
         T, joints = (
             x.repeat(k if x.shape[1] > 1 or r == 1 else r * k, axis=1) for x in (T, joints)
         )
         each = MeasuredColumns(columns, reference, present, measured.is_complete)
         residual, jacobian, by_own, by_joints = kind.evaluate(T, each, own, joints)
         assert by_own is not None
-        m, links = residual.shape[2], jacobian.shape[2:-2]
-        by_pose = np.moveaxis(jacobian.reshape(-1, r, k, *links, m, 6), 2, -3)
-        by_setup = spread_columns(by_own, np.tile(places, (r, 1)), values.shape[-1])
+        (t, _, m), links, u = residual.shape, jacobian.shape[2:-2], values.shape[-1]
+        by_pose = np.moveaxis(jacobian.reshape(t, r, k, *links, m, 6), 2, -3)
+        by_setup = spread_columns(by_own, np.tile(places, (r, 1)), u)
         return Evaluation(
-            residual.reshape(-1, r, k * m),
-            by_pose.reshape(-1, r, *links, k * m, 6),
-            by_setup.reshape(-1, r, k * m, values.shape[-1]),
-            None if by_joints is None else by_joints.reshape(-1, r, k * m, by_joints.shape[-1]),
+            residual.reshape(t, r, k * m),
+            by_pose.reshape(t, r, *links, k * m, 6),
+            by_setup.reshape(len(by_own), r, k * m, u),
+            None if by_joints is None else by_joints.reshape(t, r, k * m, by_joints.shape[-1]),
         )
 
     def _find_platform(self, T: FloatArray, joints: FloatArray) -> FloatArray:
