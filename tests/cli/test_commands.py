@@ -283,6 +283,12 @@ def test_check_expand_of_every_shipped_robot_truncates_no_number(loopcal, robot)
     assert {limb["name"] for limb in document["assembly"]["limbs"]}
 
 
+def test_check_expand_shows_anchors_and_dead_points_of_triangle_drives(loopcal) -> None:
+    page = " ".join(loopcal("check excavator --expand").out.split())
+    assert "boom-cylinder -400 600 0 350 2300 0 mm" in page
+    assert "boom-cylinder 1605.37 3047.59 mm" in page
+
+
 def test_simulate_writes_the_drawn_errors_as_a_robot_file(loopcal) -> None:
     words = "simulate hexapod-42 --poses poses.csv --draw-errors --truth drawn.yaml -o drawn.csv"
     loopcal(words)

@@ -85,6 +85,11 @@ TRIANGLE_TERMS = (
 MOVABLE = 8  # number of the terms that parameters can change
 
 
+def complete_triangle(terms: Mapping[str, float]) -> FloatArray:
+    """Return the terms (10,) of a triangle from those that are stated; others are zero."""
+    return np.array([terms.get(term, 0.0) for term in TRIANGLE_TERMS])
+
+
 def compute_angle(length: FloatArray, triangle: FloatArray) -> FloatArray:
     """Return the joint angle [rad] at a length (..) [m] of triangles (.., 10), NaN out of reach."""
     level, reach, gamma = describe_triangle(triangle)

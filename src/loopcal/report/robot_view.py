@@ -11,7 +11,14 @@ import numpy as np
 
 from loopcal import geometry
 from loopcal.findings.wording import name_count
-from loopcal.mechanism.transmission import LOAD, TABLE, TRIANGLE_TERMS, WEIGHT, compute_range
+from loopcal.mechanism.transmission import (
+    LOAD,
+    TABLE,
+    TRIANGLE_TERMS,
+    WEIGHT,
+    complete_triangle,
+    compute_range,
+)
 from loopcal.results.tables import (
     ABSENT,
     Block,
@@ -82,7 +89,7 @@ def _build_triangle_table(robot: Mechanism) -> Table:
     units, rows = robot.shown_units, []
     length, angle = units[Dimension.LENGTH], units[Dimension.ANGLE]
     for actuator in (a for a in robot.actuators if a.is_triangle):
-        terms = np.array([actuator.terms[term] for term in TRIANGLE_TERMS])
+        terms = complete_triangle(actuator.terms)
         middle, ends = terms[-1], np.array([-1.0, 1.0]) * terms[-2] * np.pi / 2
         numbers = [format_in(length, float(end)) for end in compute_range(terms)]
         angles = [format_in(angle, end) for end in middle + ends]
@@ -244,7 +251,7 @@ def _build_anchor_table(robot: Mechanism, units: Units) -> Table:
     length, angle = units[Dimension.LENGTH], units[Dimension.ANGLE]
     rows = []
     for actuator in (a for a in robot.actuators if a.is_triangle):
-        terms = [actuator.terms[term] for term in TRIANGLE_TERMS]
+        terms = complete_triangle(actuator.terms).tolist()
         shown = [_format(value, length) for value in terms[:6]]
         skew = [_format(value, angle) for value in terms[6:8]]
         rows.append((actuator.name, *shown, length.symbol, *skew, angle.symbol))

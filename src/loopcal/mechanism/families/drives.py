@@ -35,8 +35,8 @@ from loopcal.mechanism.transmission import (
     HARMONICS,
     LOAD,
     TABLE,
-    TRIANGLE_TERMS,
     WEIGHT,
+    complete_triangle,
     compute_range,
     count_independent,
     evaluate_sums,
@@ -781,8 +781,7 @@ def _word_stroke(placed: PlacedRow) -> str:
     if not isinstance(placed.drive, TriangleDrive):
         return ""
     terms = placed.actuator.terms
-    triangle = np.array([terms.get(term, 0.0) for term in TRIANGLE_TERMS])
-    low, high = (float(end) for end in compute_range(triangle))
+    low, high = (float(end) for end in compute_range(complete_triangle(terms)))
     ends = [terms["offset"] + terms["gain"] * reading for reading in placed.stroke or ()]
     outside = [f"{end * 1e3:.6g} mm" for end in ends if np.isfinite(end) and not low <= end <= high]
     if not outside:
@@ -866,7 +865,7 @@ def choose_side(
     this side. stated : the other terms. Raises RecordError: an anchor on the axis, or a start at a
     dead point.
     """
-    terms = np.array([stated.get(term, 0.0) for term in TRIANGLE_TERMS])
+    terms = complete_triangle(stated)
     low, high = (float(end) for end in compute_range(terms))
     # b of l^2 = a - b cos(theta - gamma) is twice the product of both levers
     if not high**2 - low**2 > 4 * ON_AXIS * (terms[:6].reshape(2, 3) ** 2).sum(axis=1).max():
