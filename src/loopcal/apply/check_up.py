@@ -21,7 +21,6 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from loopcal.apply.calibration_report import Verdict
 from loopcal.apply.validation import (
     REFUSED_SHARE,
     find_error_units,
@@ -41,6 +40,7 @@ from loopcal.measure.fitted_rows import FittedRows, collect_fitted_rows
 from loopcal.measure.kinds.kind import SCALES
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.readings import fill_in_reading_sigma
+from loopcal.numerics.elimination import eliminate_columns
 from loopcal.numerics.statistics import compute_f_tail
 from loopcal.results.description import Field, each, fields, label_axes, pick
 from loopcal.results.result import DrawnResult
@@ -220,7 +220,7 @@ def check_up(
     assert judged is not None
     last = done[-1]
     said: dict[str, Any] = {"check": last.name, "together": last.together, **judged.data}
-    said["failed"] = run.result["verdict"] == Verdict.NOT_CALIBRATED.name.lower()
+    said["failed"] = run.failure is not None
     said |= {"p_value": last.p_value, "level": false_alarms, "a_year": a_year}
     finding = report_finding("checks.machine-unchanged", **said)
     if last.alarm:
@@ -264,14 +264,14 @@ def _collect_rows(
     for i, entry in enumerate(after.setup.table.entries):
         is_own[i] = entry.free and entry.name not in after.kept
     stacked = np.column_stack([columns[0][:, is_own], columns[0][:, ~is_own], -residual[0]])
-    # a column of zeros, as of a target nobody measured, eliminates no row
-    count = int(np.any(columns[0][:, is_own] != 0.0, axis=0).sum())
-    triangle = np.asarray(np.linalg.qr(stacked, mode="r"))
-    left = triangle[count : stacked.shape[1] - 1, int(is_own.sum()) :]
-    rest_degrees = max(len(stacked) - stacked.shape[1] + 1, 0)
-    rest = float(triangle[-1, -1] ** 2) if rest_degrees else 0.0
-    p = len(uncertainty.posterior.unit)
-    first = len(names) - int(is_own.sum())
+    count = int(is_own.sum())
+    absent = np.zeros((max(count - len(stacked), 0), stacked.shape[1]))
+    free = eliminate_columns(np.concatenate([stacked, absent]), count).rest
+    free = free[free.any(axis=1)]
+    left = np.asarray(np.linalg.qr(free, mode="r"))
+    rest_degrees = max(len(free) - free.shape[1] + 1, 0)
+    rest = float(left[-1, -1] ** 2) if rest_degrees else 0.0
+    left, p, first = left[: free.shape[1] - 1], len(uncertainty.posterior.unit), len(names) - count
     owners = [
         tuple(dict.fromkeys(owner_of(name) for i, name in enumerate(names) if is_own[i] == which))
         for which in (False, True)
@@ -294,7 +294,7 @@ class CombinedChecks(NamedTuple):
 
 def _combine(uncertainty: FitUncertainty, rows: list[CheckRows]) -> CombinedChecks:
     """Return what some checks together say."""
-    posterior, degrees = uncertainty.posterior, find_noise_degrees(uncertainty)
+    posterior, degrees = uncertainty.posterior, uncertainty.noise.known_degrees
     p, q = len(posterior.unit), rows[0].known.shape[1]
     stacked = np.concatenate(
         [np.column_stack([c.by_parameters * posterior.unit, c.known, c.value]) for c in rows]
@@ -316,12 +316,6 @@ def _combine(uncertainty: FitUncertainty, rows: list[CheckRows]) -> CombinedChec
     return CombinedChecks(changes, max(rest, 0.0), count)
 
 
-def find_noise_degrees(uncertainty: FitUncertainty) -> float:
-    """Return the degrees of freedom of the noise of a calibration; infinite where it was stated."""
-    degrees = uncertainty.noise.degrees
-    return np.inf if np.isnan(degrees) else degrees
-
-
 def _judge(
     uncertainty: FitUncertainty, rows: list[CheckRows], false_alarms: float, a_year: int
 ) -> tuple[JudgedChange, int, float]:
@@ -339,7 +333,7 @@ def _judge(
     p_value, together = judged.p_value, sizes[best]
     rest, count = combined[0].rest, combined[0].rest_degrees
     if count:
-        p_rest = float(compute_f_tail(count, find_noise_degrees(uncertainty), rest / count))
+        p_rest = float(compute_f_tail(count, uncertainty.noise.known_degrees, rest / count))
         p_value, together = min((p_value, together), (p_rest, 0))
     return judged, together, min(tests * p_value, 1.0)
 

@@ -102,9 +102,7 @@ class ErrorChange:
     @property
     def largest_noise(self) -> float:
         """The rms that noise alone exceeds with the probability `NOISE_LEVEL`."""
-        degrees = self.noise.degrees
-        degrees = np.inf if np.isnan(degrees) else degrees  # infinity is no number of JSON
-        square = compute_f_quantile(max(self.values, 1), degrees, NOISE_LEVEL)
+        square = compute_f_quantile(max(self.values, 1), self.noise.known_degrees, NOISE_LEVEL)
         return self.noise_floor * self.noise.scale * float(np.sqrt(square))
 
     @property

@@ -212,6 +212,11 @@ class NoiseKnowledge:
     scale: float = 1.0
     degrees: float = 0.5 / SIGMA_UNCERTAINTY**2
 
+    @property
+    def known_degrees(self) -> float:
+        """The degrees of freedom; infinite where they are NaN, as infinity is no number of JSON."""
+        return np.inf if np.isnan(self.degrees) else self.degrees
+
     @classmethod
     def of(cls, test: ResidualTest) -> NoiseKnowledge:
         """Return what the residuals of a fit show; sigma as stated where they show nothing, or are
