@@ -22,23 +22,23 @@ PLACEHOLDER = re.compile(r"\{(?P<name>\w+)[^{}]*\}")
 SEVERITIES = {
     Severity.INFO: "worth knowing. The result is usable as it is",
     Severity.SUGGESTION: "a step that would improve the result",
-    Severity.WARNING: "the result is usable with care; the text says what to check",
-    Severity.FAILURE: "a quality gate is not met (exit code 2), or the command failed (exit code "
-    "1). Do not use the result, unless the gate is a stated limit: then the values are usable, and "
-    "the limit is not met",
-    Severity.REFUSAL: "the input was refused before anything was computed",
+    Severity.WARNING: "check what the text names before you use the result",
+    Severity.FAILURE: "do not use the result (exit code 2, or 1 if the command failed). If only a "
+    "limit is not met, the values are usable",
+    Severity.REFUSAL: "loopcal refused the input before computing",
 }
 HEAD = """# Findings
 
 <!-- made by tools.findings_reference; `make docs` writes it anew -->
 
-Every note, warning, suggestion and refusal is a finding: a code, a severity, data and a text.
-Programs read code and data; the text is for people and may change. In Python, `fit.findings` and
-other results hold findings, `str(finding)` is the text, and an error made from a finding has its
-`code`. In JSON, a finding has the keys `code`, `severity`, `data` and `text`.
+Notes, warnings and refusals are findings: a code, a severity, data and a text. Programs read code
+and data. The text is for people and may change. In Python, results hold `findings`, `str(finding)`
+is the text, and an error has the `code` of its finding. In JSON, the keys are `code`, `severity`,
+`data` and `text`.
 
-In the texts below, words in *italics* are replaced by data. Where a text differs in more than its
-data, an example is shown in quotation marks. The last columns are empty where the text says it.
+Words in *italics* stand for data, and texts in quotation marks are examples. A text that begins
+with a small letter is a part of another message. The last column adds the condition and the next
+step that the text leaves out.
 """
 
 
@@ -59,13 +59,12 @@ def write_page() -> str:
                 f"`{e.code}`",
                 e.severity.value,
                 describe_text(e),
-                e.when,
-                fill_template(e.action, **e.example),
+                f"{e.when} {fill_template(e.action, **e.example)}".strip(),
             )
             for e in catalog.read_entries(file).values()
         ]
         sections.append(f"## {catalog.read_document(file)['title']}\n")
-        sections.append(format_table(("code", "severity", "text", "when", "what to do"), rows))
+        sections.append(format_table(("code", "severity", "text", "when, and what to do"), rows))
     return "\n".join(sections)
 
 
