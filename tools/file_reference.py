@@ -69,11 +69,20 @@ def format_record(record: type, without: Iterable[str] = ()) -> str:
     """Return the keys of a record but those that `without` names."""
     excluded = set(without)
     keys = [key for key in file_reference.list_keys(record) if key.name not in excluded]
-    if not any(key.meaning for key in keys):
-        phrases = (f"`{k.name}`: {_hold(k)}" + f" ({k.default})" * bool(k.default) for k in keys)
-        return "".join(f"- {phrase}\n" for phrase in phrases)
-    rows = [(f"`{k.name}`", _hold(k), k.default, k.meaning) for k in keys]
-    return format_table(("key", "holds", "default", "meaning"), rows)
+    rows = merge_rows((f"`{k.name}`", _hold(k), k.default, k.meaning) for k in keys)
+    if any(key.meaning for key in keys):
+        return format_table(("key", "holds", "default", "meaning"), rows)
+    return "".join(
+        f"- {name}: {holds}{default and f' ({default})'}\n" for name, holds, default, _ in rows
+    )
+
+
+def merge_rows(rows: Iterable[tuple[str, ...]]) -> list[tuple[str, ...]]:
+    """Return rows of a table, with one row for all names of which the other cells are equal."""
+    names: dict[tuple[str, ...], list[str]] = {}
+    for name, *cells in rows:
+        names.setdefault(tuple(cells), []).append(name)
+    return [(", ".join(equal), *cells) for cells, equal in names.items()]
 
 
 def _hold(key: file_reference.Key) -> str:
@@ -129,7 +138,7 @@ def format_kinds() -> str:
         shared = [f"`{key}`" for key, words in meanings[name].items() if (key, words) in common]
         if shared:
             parts += [f"Common settings: {', '.join(shared)}.\n"]
-        own = [(f"`{k}`", w) for k, w in meanings[name].items() if (k, w) not in common]
+        own = merge_rows((f"`{k}`", w) for k, w in meanings[name].items() if (k, w) not in common)
         sections.append("\n".join([*parts, *([format_table(header, own)] if own else [])]))
     return "\n".join(sections)
 

@@ -67,8 +67,10 @@ class TargetKind(Kind):
         the kinds position, bearing and distance): the targets are fixed to the base. Their rows
         belong to no pose, and unknown ones keep their places in all sessions.
 
-    Raises ------ DataError : shapes do not fit, a name occurs twice, `unknown` lists something that
-    is not allowed, or places of targets on the base are neither given nor unknown.
+    Raises
+    ------
+    DataError : shapes do not fit, a name occurs twice, `unknown` lists something that is not
+        allowed, or places of targets on the base are neither given nor unknown.
     """
 
     targets: tuple[str, ...] = ("target",)
