@@ -14,7 +14,7 @@ from loopcal.cli import options as opt
 from loopcal.cli import terminal
 from loopcal.cli.hints import suggest_command
 from loopcal.cli.terminal import Output
-from loopcal.errors import DataError, FileError
+from loopcal.errors import DataError
 from loopcal.units import Dimension, list_symbols
 
 
@@ -71,14 +71,12 @@ def measure(
     """
     from loopcal.cli.measuring_dialog import Dialog
     from loopcal.findings.wording import name_count
-    from loopcal.io.data.measurement_file import has_empty_readings, load_instrument_to_plan
-    from loopcal.io.exports.conversion import read_sheet
     from loopcal.io.exports.growing_export import GrowingExport
     from loopcal.io.exports.profile import find_profile_file, read_profile, with_local_settings
-    from loopcal.io.runs.plan_folder import DATA, find_asked, find_plan_robot
+    from loopcal.io.runs.plan_folder import DATA, find_plan_robot
     from loopcal.io.runs.session_folder import open_session
-    from loopcal.planning.companion import Pace, prepare_task
-    from loopcal.planning.constraints import restore_options
+    from loopcal.measuring import prepare_session
+    from loopcal.planning.companion import Pace
 
     if (follow is None) != (profile is None):
         raise DataError("--follow and --profile belong together. Give both, or none")
@@ -92,26 +90,16 @@ def measure(
         if has_changed:
             terminal.print_finding("session.robot-changed", robot=robot)
     machine = lc.load_robot(robot).with_conditions(dict(at))
-    table, entry = read_sheet(sheet, machine)
-    if has_empty_readings(sheet, machine):
-        raise FileError("this sheet asks for readings. Fill in the file itself", sheet)
+    pace = Pace(minutes) if speed is None else Pace(minutes, 1e-3 * speed)
+    task, table, entry = prepare_session(sheet, machine, accuracy, pace, check_every)
     export = None
     if follow is not None and profile is not None:
         read = read_profile(find_profile_file(profile))
         read = with_local_settings(read, unit, decimal == "comma")
         export = GrowingExport(follow, read, entry, by_order)
-    goal = {} if accuracy is None else dict(zip(("goal", "target"), accuracy, strict=True))
-    task = prepare_task(
-        lc.load_measurements(sheet, machine),
-        machine,
-        load_instrument_to_plan(sheet, machine),
-        restore_options({**find_asked(sheet), **goal}),
-        Pace(minutes) if speed is None else Pace(minutes, 1e-3 * speed),
-        check_every,
-    )
     is_silent = bool(click.get_current_context().params["as_json"])
     with open_session(output, table, [column.name for column in entry.kind.columns]) as journal:
-        dialog = Dialog(task, journal, export, gcode, is_silent)
+        dialog = Dialog(task, journal, export, gcode, is_silent=is_silent)
         with suppress(KeyboardInterrupt):  # each row is on the disk
             dialog.run()
     visits = journal.visits
