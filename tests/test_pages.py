@@ -28,10 +28,7 @@ OWN_TESTS = {
     "docs/planning.md": "tests/cli/test_planning_page.py",
     "docs/report.md": "tests/documents/test_report_page.py",
     "docs/studies.md": "tests/cli/test_studies_page.py",
-    **{
-        f"docs/papers/{name}.md": f"tests/papers/test_{name.replace('-', '_')}.py"
-        for name in ("cmm-constraint-2011", "hexapod-42", "tsvd-2016")
-    },
+    "docs/papers.md": "tests/papers/test_reproductions.py",
     "examples/studies/README.md": "tests/cli/test_question_pages.py",
 }
 """From a page to the test file that runs its blocks."""

@@ -24,8 +24,11 @@ from tools.machine import describe_machine
 from tools.markdown import fill_blocks, format_table
 
 ROOT = Path(__file__).resolve().parent.parent
-BLOCK = r"evidence: (?P<name>[\w-]+)\.(?P<table>[\w-]+)(?:, (?P<column>[^=>]+) = (?P<value>[^>]+))?"
-"""A table of an evidence file, or its rows with this value in this column."""
+BLOCK = (
+    r"evidence: (?P<name>[\w-]+)\.(?P<table>[\w-]+)(?:, (?P<column>[^=>]+) = (?P<value>[^>]+?))?"
+    r"(?:, columns to (?P<last>[^>]+))?"
+)
+"""A table of an evidence file, or its rows with a value in a column, or its columns to one."""
 
 
 class EvidenceError(Exception):
@@ -181,6 +184,10 @@ def fill_tables(text: str, folder: Path) -> str:
             spec = table.get("formats", {at: ""})[at]
             rows = [r for r in table["rows"] if _render_cell(r[at], spec) == match["value"]]
             table = {**table, "rows": rows}
+        if match["last"]:
+            end = table["columns"].index(match["last"]) + 1
+            kept = {key: table[key][:end] for key in ("columns", "formats") if key in table}
+            table = {**kept, "rows": [row[:end] for row in table["rows"]]}
         return render_table(table)
 
     return fill_blocks(text, BLOCK, write)

@@ -3,7 +3,7 @@
 
 The small version below draws 6 machines, uses fewer sweeps of the exchange, and has wide bounds.
 The tests marked `evidence` use 200 machines.
-Page: docs/papers/cmm-constraint-2011.md.
+Page: docs/papers.md.
 """
 
 import json

@@ -4,7 +4,7 @@
 Statistics are over 10 drawings (seed 0). Their bounds are written beside them and hold for seeds 0
 to 6 too. A root mean square over 10 drawings of few independent directions has an uncertainty of
 some 15 %.
-Page: docs/papers/hexapod-42.md.
+Page: docs/papers.md.
 """
 
 from collections.abc import Callable

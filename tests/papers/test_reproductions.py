@@ -200,12 +200,13 @@ def test_unknown_paper_and_invalid_seed_or_trials_are_refused() -> None:
 
 
 @pytest.mark.parametrize("paper", PAPERS.values(), ids=PAPERS)
-def test_page_of_a_paper_lists_exactly_the_files_of_its_study(paper) -> None:
-    page = (ROOT / "docs" / "papers" / f"{paper.name}.md").read_text("utf-8")
+def test_page_of_papers_has_a_section_of_each_and_lists_the_files_of_its_study(paper) -> None:
+    page = (ROOT / "docs" / "papers.md").read_text("utf-8")
+    assert f"\n## {paper.name}: " in page
     folder = ROOT / "src" / "loopcal" / "papers" / paper.name.replace("-", "_")
     named = set(re.findall(r"`(\w+\.(?:py|yaml))`", page))
     files = {path.name for path in folder.iterdir() if path.suffix in {".py", ".yaml"}}
-    assert {name for name in named if not name.endswith("_draws.py")} == files - {"__init__.py"}
+    assert files - {"__init__.py"} <= named
     assert paper.title
     assert paper.source
 

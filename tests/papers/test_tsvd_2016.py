@@ -2,7 +2,7 @@
 """LS, RE and TSVD on two parallel manipulators: steps, claims of the paper, many machines.
 
 The small version below draws 6 machines; the tests marked `evidence` check the bounds at full size.
-Page: docs/papers/tsvd-2016.md.
+Page: docs/papers.md.
 """
 
 import json

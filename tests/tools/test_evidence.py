@@ -38,6 +38,12 @@ def test_block_with_a_value_shows_the_rows_that_have_it(tmp_path: Path) -> None:
     filled = evidence.fill_tables(page, tmp_path)
     assert filled.splitlines()[1:-1] == ["| case | met |", "| --- | --- |", "| drift | no |"]
     assert evidence.fill_tables(filled, tmp_path) == filled
+    short = page.replace("= no", "= no, columns to case")
+    assert evidence.fill_tables(short, tmp_path).splitlines()[1:-1] == [
+        "| case |",
+        "| --- |",
+        "| drift |",
+    ]
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The ten steps of the paper's section 5 (docs/papers/hexapod-42.md), repeated with other noises,
+"""The ten steps of the paper's section 5 (docs/papers.md), repeated with other noises,
 methods and poses, beside the printed tables, and the judged claims.
 
 Least squares is `identify_per_leg`, one step at a time, every equation of weight one and every

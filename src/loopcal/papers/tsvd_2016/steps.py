@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The nine steps of the paper (docs/papers/tsvd-2016.md), for t machines or t settings of lambda
+"""The nine steps of the paper (docs/papers.md), for t machines or t settings of lambda
 and k at once. The first of the drawn machines is measured with the printed noise.
 
 Raw numbers as in the paper: millimeters and radians, every equation and every parameter of weight
