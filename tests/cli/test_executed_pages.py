@@ -25,7 +25,6 @@ PAGES = (
     "machines",
     "robots",
     "self-calibration",
-    "urdf",
 )
 
 
