@@ -170,22 +170,35 @@ def differentiate_at_pose(
 ITERATIONS = 60  # newton steps of a pose; those within reach need fewer than ten
 
 
-def measure_sums(program: Program, weights: FloatArray) -> FloatArray:
-    """Return lengths (r,) [m] that a unit of each sum counts for: the motion of the joint that has
-    most of it, an angle at the size of the robot.
+# Weight of readings that are more than the freedoms, beside closure: where they contradict each
+# other, the loops open by the square of it.
+SOFT = 0.1
+
+
+def measure_sums(robot: Mechanism, weights: FloatArray) -> FloatArray:
+    """Return lengths (r,) [m] that a unit of each of the last sums counts for: the motion of the
+    joint that has most of it, an angle at the size of the robot. Readings that are more than the
+    freedoms count by their standard deviations, if these are known.
     """
-    units = np.ones(program.n_joints)
+    program, units = robot.program, np.ones(robot.program.n_joints)
     for group in program.groups:
         for j in group.driven_joints:
             if group.joints[j : j + 1] == "R":
                 units[group.actuator[j]] = program.size
     with np.errstate(divide="ignore"):
-        return (1.0 / (np.abs(weights[0]) / units).max(axis=1)).clip(max=1e12)
+        lengths = (1.0 / (np.abs(weights[0]) / units).max(axis=1)).clip(max=1e12)
+    readings = np.array([row.column is None for row in robot.assembly.rows[-len(lengths) :]])
+    if robot.has_open_sums and robot.program.may_stay_open and readings.any():
+        rows = [row for row in robot.assembly.rows if row.column is None]
+        sigma = [(row.sigma or 0.0) * abs(row.terms.get("gain", 1.0)) for row in rows]
+        own = 1.0 / np.array(sigma) if all(sigma) else lengths[readings]
+        lengths[readings] = SOFT * lengths[readings].max() * own / own.max()
+    return lengths
 
 
-def scale_sums(program: Program, weights: FloatArray, sums: FloatArray) -> engine.Sums:
+def scale_sums(robot: Mechanism, weights: FloatArray, sums: FloatArray) -> engine.Sums:
     """Return sums (t | 1, n, r) of driven joints as the engine takes them, in lengths."""
-    units = measure_sums(program, weights)
+    units = measure_sums(robot, weights)
     return engine.Sums(weights * units[:, None], sums * units)
 
 
@@ -201,18 +214,29 @@ def stack_sum_rows(
 
 
 def differentiate_unknowns_by_sums(
-    program: Program, e: FloatArray, state: State, weights: FloatArray
+    robot: Mechanism, e: FloatArray, state: State, weights: FloatArray
 ) -> FloatArray:
     """Return derivatives (t, n, M + J, r) of freedoms and driven joints by weighted sums."""
-    blocks = engine.linearize(program, e, program.list_drives(state.joints), state)
-    rows = stack_sum_rows(program, blocks, weights)
-    return invert_rows(rows)[..., rows.shape[2] - weights.shape[1] :]
+    joints = driven_values(robot.program, state)
+    blocks = engine.linearize(robot.program, e, joints, state)
+    return invert_sum_rows(robot, blocks, weights)[..., -weights.shape[1] :]
 
 
-def invert_rows(rows: FloatArray) -> FloatArray:
-    """Return the inverses of rows (.., c, m), c >= m, those of least squares with more rows, NaN
-    where one is singular or not finite.
+def invert_sum_rows(
+    robot: Mechanism, blocks: engine.ClosureBlocks, weights: FloatArray
+) -> FloatArray:
+    """Return the inverses (t, n, M + J, c + r) of the rows of `stack_sum_rows`, c + r >= M + J,
+    those of least squares with more rows, NaN where one is singular or not finite.
     """
+    units = measure_sums(robot, weights)
+    rows = stack_sum_rows(robot.program, blocks, weights * units[:, None])
+    inverse = _invert_rows(rows)
+    inverse[..., -len(units) :] *= units
+    return inverse
+
+
+def _invert_rows(rows: FloatArray) -> FloatArray:
+    """Return the inverses of rows (.., c, m), c >= m, see `invert_sum_rows`."""
     c, m = rows.shape[-2:]
     if c == m:
         return invert_weights(rows)
@@ -236,7 +260,7 @@ def _differentiate_open(
         own, readings = select_block(values, rows[:1]), select_block(q, rows)
         block = map_arrays(lambda a, rows=rows: a[rows], state)
         weights, moved = _differentiate_sums(robot, own, readings, block)
-        inverse = invert_rows(stack_sum_rows(program, blocks, weights[:, 0]))
+        inverse = invert_sum_rows(robot, blocks, weights[:, 0])
         E = stack_displacement_columns(program, blocks)
         opened = np.matmul(E, select_block(displacements, rows[:1])[:, None])
         c = opened.shape[2]

@@ -191,8 +191,7 @@ def _close_at_home(
         joints = driven_values(robot.program, robot.home_state)
         return replace(robot, home_state=solve_serial(robot, e, joints))
     robot = replace(robot, home_state=_find_home(robot))
-    check_mobility(robot)
-    return robot
+    return check_mobility(robot)
 
 
 def compute_characteristic_length(assembly: Assembly) -> float:
@@ -337,7 +336,8 @@ def _weigh_actuators(
     if assembly.couplings or len(assembly.rows) <= len(freedoms):
         return None
     what = f"{len(assembly.rows)} actuators for {len(freedoms)} freedoms"
-    for group in groups:
+    has_sums = any(row.weights for row in assembly.rows)
+    for group in () if has_sums else groups:
         rows = len(group.rows) - len(group.unknown_joints(False))
         driven = int((group.actuator[:, 0] >= 0).sum())
         if rows != driven or driven != 1:
@@ -352,7 +352,7 @@ def _weigh_actuators(
             f"{assembly.name} has more actuators than freedoms. Give a positive sigma for every "
             "actuator, or for none"
         )
-    return tuple(s / max(sigma) for s in sigma)
+    return None if has_sums else tuple(s / max(sigma) for s in sigma)
 
 
 def _check_sums(assembly: Assembly, freedoms: tuple[int, ...]) -> None:
@@ -369,11 +369,6 @@ def _check_sums(assembly: Assembly, freedoms: tuple[int, ...]) -> None:
         )
     if assembly.couplings or not any(own.weights for own in assembly.rows):
         return
-    if a > m:
-        raise MechanismError(
-            f"{assembly.name} has {a} readings for {m} freedoms, and some of them are sums. Leave "
-            "out readings, because redundant readings cannot be sums"
-        )
     if a < m and a != joints:
         raise MechanismError(
             f"{assembly.name} has {a} readings of {joints} driven joints for {m} freedoms, so its "

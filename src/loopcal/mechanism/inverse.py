@@ -121,7 +121,7 @@ def _close_with_free_actuators(
     begin = replace(begin, T=T)
     if robot.assembly.couplings:
         sums = list_open_sums(robot, values)
-        own = scale_sums(robot.program, sums.weights[:, sums.chosen :], sums.fixed)
+        own = scale_sums(robot, sums.weights[:, sums.chosen :], sums.fixed)
         given = begin, command, False, max_iterations
         return engine.solve(robot.program, e, guess, *given, sums=own)
     guess = np.broadcast_to(guess, (t, n, robot.program.n_joints))
@@ -148,11 +148,9 @@ def moves_by_drives(robot: Mechanism) -> bool:
     close no loop, joints with a shared drive and coupled ones would part, and an actuator of loops
     that may stay open would take a part of the gap.
     """
-    program = robot.program
-    is_bound = (
-        program.may_stay_open or program.shared_drive_count > 0 or bool(robot.assembly.couplings)
-    )
-    return bool(robot.stages) or is_bound
+    is_open = robot.program.may_stay_open and robot.assembly.closure != "exact"
+    is_bound = robot.program.shared_drive_count > 0 or bool(robot.assembly.couplings)
+    return bool(robot.stages) or is_open or is_bound
 
 
 # A sphere that the platform cannot leave, from the lengths of the links.

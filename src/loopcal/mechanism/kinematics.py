@@ -148,7 +148,7 @@ class Loops(NamedTuple):
         """Return values (t | 1, n, a) as sums of driven joints, None where they are joints."""
         if self.weights is None:
             return None
-        return scale_sums(self.robot.program, self.weights, values)
+        return scale_sums(self.robot, self.weights, values)
 
     def read(self, state: State) -> FloatArray:
         """Return the joint values or sums (t, n, a) of a state."""

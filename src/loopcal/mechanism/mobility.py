@@ -59,8 +59,10 @@ STRETCHED = 1e-5
 MAIN_SHARE = 0.3
 
 
-def check_mobility(robot: Mechanism) -> None:
-    """Refuse actuators that cannot move and hold the platform at home; the error names freedoms."""
+def check_mobility(robot: Mechanism) -> Mechanism:
+    """Return the robot, with loops that may stay open where its sums are more than its freedoms.
+    Refuse actuators that cannot move and hold the platform at home; the error names freedoms.
+    """
     program, home = robot.program, robot.home_state
     blocks = linearize_state(robot, home)
     scale = 1 / robot.twist_scale[list(program.freedoms)]
@@ -93,7 +95,7 @@ def check_mobility(robot: Mechanism) -> None:
     if robot.assembly.couplings:
         sums = list_open_sums(robot, robot.values[None])
         a, coupled = sums.chosen, sums.weights[:, sums.chosen :]
-        coupled = coupled[0] * measure_sums(program, coupled)[:, None]
+        coupled = coupled[0] * measure_sums(robot, coupled)[:, None]
         rows = np.concatenate([rows, np.pad(coupled, [(0, 0), (m, 0)])])
     _, both, W = np.linalg.svd(rows, full_matrices=True)
     # motions with every actuator free: solutions (y, dq) of A y + Q dq = 0, A of full column rank
@@ -124,8 +126,8 @@ def check_mobility(robot: Mechanism) -> None:
     rates = np.linalg.svd(_differentiate_controlled(robot, robot.home) @ D, compute_uv=False)
     if count_rank(rates) < movable:
         raise MechanismError(_word_dependent(robot, movable))
-    if robot.has_open_sums:
-        _check_open_sums(robot, blocks)
+    is_redundant = robot.has_open_sums and _check_open_sums(robot, blocks)
+    return replace(robot, program=replace(program, may_stay_open=True)) if is_redundant else robot
 
 
 def refuse_free_bodies(robot: Mechanism, state: engine.State) -> None:
@@ -149,12 +151,14 @@ def refuse_free_bodies(robot: Mechanism, state: engine.State) -> None:
         raise MechanismError(finding)
 
 
-def _check_open_sums(robot: Mechanism, blocks: engine.ClosureBlocks) -> None:
-    """Refuse sums that leave the platform free at home, or that are too many for its loops."""
+def _check_open_sums(robot: Mechanism, blocks: engine.ClosureBlocks) -> bool:
+    """Return whether the sums are more than the freedoms at home, where they contradict each other
+    by their errors. Refuse sums that leave the platform free, and too many couplings.
+    """
     program, (_, tau) = robot.program, robot.slots(robot.values[None])
     weights = select_weights(tau, robot.slots.constants)
     assert weights is not None
-    rows = stack_sum_rows(program, blocks, weights * measure_sums(program, weights)[:, None])[0, 0]
+    rows = stack_sum_rows(program, blocks, weights * measure_sums(robot, weights)[:, None])[0, 0]
     scale = [1 / robot.twist_scale[f] for _, f in program.unknown_twists]
     rows[:, : len(scale)] *= scale
     closure = len(rows) - weights.shape[1]
@@ -166,11 +170,7 @@ def _check_open_sums(robot: Mechanism, blocks: engine.ClosureBlocks) -> None:
             f"`sum:`, or give another `home:`"
         )
     free = unknown - count_rank(np.linalg.svd(rows[:closure], compute_uv=False))
-    if sums > free:
-        raise MechanismError(
-            f"{robot.name} has {sums} readings and couplings, but only {free} freedoms without "
-            f"them. Leave out {sums - free}, because redundant ones cannot be sums"
-        )
+    return sums > free
 
 
 def refuse_uncontrolled(robot: Mechanism, state: engine.State) -> None:

@@ -364,7 +364,7 @@ class Mechanism(DrawnResult):
     @cached_property
     def is_serial(self) -> bool:
         """Whether the pose is the product of driven joints: one limb without passive joints."""
-        return is_serial(self.assembly)
+        return is_serial(self.assembly) and not self.has_open_sums
 
     @cached_property
     def has_sums(self) -> bool:
@@ -378,8 +378,12 @@ class Mechanism(DrawnResult):
 
     @cached_property
     def has_open_sums(self) -> bool:
-        """Whether only closure determines the driven joints, because their sums are fewer."""
-        return not self.stages and self.program.n_joints > len(self.assembly.rows)
+        """Whether closure takes part in determining the driven joints, because their sums are
+        fewer, or more than the freedoms.
+        """
+        rows, readings = self.assembly.rows, len(self.assembly.rows) - len(self.assembly.couplings)
+        is_square = self.program.n_joints == len(rows) and readings <= len(self.freedoms)
+        return self.has_sums and not self.stages and not is_square
 
     @cached_property
     def all_parameters(self) -> ParameterUnits:

@@ -122,7 +122,7 @@ def report_over_constraint(
         repeated=_list_repeated(robot, rows),
         freedoms=_find_sufficient_freedoms(robot, close_at_home),
     )
-    program = replace(robot.program, may_stay_open=asks)
+    program = replace(robot.program, may_stay_open=asks or robot.program.may_stay_open)
     return replace(robot, program=program, findings=(*robot.findings, finding))
 
 

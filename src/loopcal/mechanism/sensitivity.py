@@ -133,7 +133,7 @@ def differentiate_by_drives(
     if weights is not None:
         freedoms = list(robot.program.freedoms)
         out = np.zeros((*u.shape[:2], 6, weights.shape[1]))
-        moved = differentiate_unknowns_by_sums(robot.program, e, state, weights)
+        moved = differentiate_unknowns_by_sums(robot, e, state, weights)
         out[:, :, freedoms] = moved[:, :, : len(freedoms)]
         return out
     is_open = robot.program.may_stay_open

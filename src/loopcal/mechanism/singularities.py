@@ -293,7 +293,7 @@ def _sum_rows(
     weights = select_weights(tau, robot.slots.constants)
     assert weights is not None
     if robot.has_open_sums:
-        moved = differentiate_unknowns_by_sums(robot.program, e, state, weights)[0]
+        moved = differentiate_unknowns_by_sums(robot, e, state, weights)[0]
         chosen = ~find_fixed_rows(robot.slots.constants)
         by_sums = moved[:, : A.shape[2]][..., chosen]
         rows = np.linalg.pinv(np.where(np.isfinite(by_sums), by_sums, 0.0))

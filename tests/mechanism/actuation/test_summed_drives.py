@@ -524,10 +524,6 @@ SECOND, THIRD = "q2: {reads: length, sum: {m: 1, k: 2}}", "q3: {reads: length, s
         ("[weight.n]", "[weight.k]", "no term 'weight.k'", 8),
         ("[weight.n]", "[wait.n]", "no term 'wait.n'", None),
         (f"  {THIRD}\n", "", "'h' of limb 'H' is in no sum", 8),
-        (f"  {THIRD}\n", "  h: {reads: length}\n  k: {reads: length}\n",
-         "redundant readings cannot be sums", None),
-        (THIRD, f"{THIRD}\n  m: {{reads: length}}\n  k: {{reads: length}}",
-         "5 readings .* are sums of 4 joints", 12),
         (f"  {SECOND}\n  {THIRD}\n", "  q2: {reads: length, sum: {k: 1, h: 2}}\n",
          "2 readings of 4 driven joints for 3 freedoms", None),
         (THIRD, "q3: {reads: angle, sum: {n: 1, h: 2}}", "adds angles, but 'n' slides", None),
@@ -565,6 +561,131 @@ def test_sums_that_do_not_hold_the_platform_are_refused(tmp_path: Path) -> None:
     )
     symmetric = symmetric.replace("-700", "-800").replace("150, 100", "150, 99.999")
     assert load_text(tmp_path, symmetric).has_open_sums
+
+
+# --- more readings than freedoms
+
+WINCHES = """format: 1
+family: limbs
+name: winches
+units: {length: m, angle: rad}
+freedoms: [x, z]
+controlled: [x, z]
+drives:
+  w1: {reads: length, sum: {a: 1}, unknown: [offset], length: {sd: 0.002}}
+  w2: {reads: angle, radius: 0.05, sum: {b: 1}, unknown: [offset], length: {sd: 0.002}}
+  w3: {reads: length, sum: {c: 1, d: 0.5}, unknown: [weight.d], weights: {sd: 0.001}}
+limbs:
+  - {name: A, tip: [-1, 0, 0.8], ending: distance, attach: [-0.15, 0, 0.1], actuated: a}
+  - {name: B, tip: [1, 0, 0.8], ending: distance, attach: [0.15, 0, 0.1], actuated: b, errors: [{of: base, shift: [x], tolerance: {sd: 0.002}}]}
+  - {name: C, tip: [-1, 0, -0.7], ending: distance, attach: [-0.15, 0, -0.1], actuated: c}
+  - {name: D, tip: [1, 0, -0.7], ending: distance, attach: [0.15, 0, -0.1], actuated: d}
+workspace: {x: [-0.4, 0.4], z: [-0.3, 0.3]}
+"""  # noqa: E501
+
+TENDONS = """format: 1
+family: limbs
+name: tendons
+units: {length: m, angle: rad}
+freedoms: [x, y, rz]
+controlled: [x, y]
+drives:
+  t1: {reads: length, radius: {q1: 0.02}, unknown: [offset], length: {sd: 0.0002}}
+  t2: {reads: length, radius: {q1: -0.018, q2: 0.015}, unknown: [radius.q2], radii: {sd: 0.0001}}
+  t3: {reads: length, radius: {q1: -0.017, q2: -0.016}}
+limbs:
+  - name: arm
+    ending: rigid
+    chain:
+      - {joint: R, name: a, axis: z, actuated: q1, start: 0.3}
+      - {joint: R, name: b, at: [0.3, 0, 0], axis: z, actuated: q2, start: 1}
+    tip: [0.25, 0, 0]
+    errors: [{of: b, shift: [x], tolerance: {sd: 0.0002}}]
+home: {x: 0.33, y: 0.34, yaw: 1.4}
+workspace: {x: [0.25, 0.4], y: [0.25, 0.4]}
+"""
+
+
+def measure_winches(robot: Mechanism, T: Array) -> Array:
+    """Return the readings of WINCHES at poses (n, 4, 4), from its drawing."""
+    ends = {"a": (-1, 0.8), "b": (get(robot, "B.base.x"), 0.8), "c": (-1, -0.7), "d": (1, -0.7)}
+    sides = {"a": (-0.15, 0.1), "b": (0.15, 0.1), "c": (-0.15, -0.1), "d": (0.15, -0.1)}
+    cables = {n: np.linalg.norm(T[:, [0, 2], 3] + sides[n] - ends[n], axis=1) for n in ends}
+    first, second = (cables[n] - get(robot, f"{w}.offset") for n, w in (("a", "w1"), ("b", "w2")))
+    third = cables["c"] + get(robot, "w3.weight.d") * cables["d"]
+    return np.column_stack([first, second / 0.05, third])
+
+
+def measure_tendons(robot: Mechanism, T: Array) -> Array:
+    """Return the readings of TENDONS at poses (n, 4, 4), from its drawing."""
+    forearm = T[:, 0, 0] + 1j * T[:, 1, 0]
+    upper = T[:, 0, 3] + 1j * T[:, 1, 3] - 0.25 * forearm
+    assert_allclose(np.abs(upper), get(robot, "arm.b.x"), rtol=0, atol=1e-12)
+    joints = np.column_stack([np.angle(upper), np.angle(forearm / upper)])
+    radii = [[0.02, 0], [-0.018, get(robot, "t2.radius.q2")], [-0.017, -0.016]]
+    return joints @ np.transpose(radii) - [get(robot, "t1.offset"), 0, 0]
+
+
+REDUNDANT = {"winches": (WINCHES, measure_winches), "tendons": (TENDONS, measure_tendons)}
+
+
+@pytest.mark.parametrize("name", REDUNDANT)
+def test_redundant_readings_may_be_sums(tmp_path: Path, name: str) -> None:
+    """Three winches on four cables that move a point, three tendons on two joints."""
+    text, measure = REDUNDANT[name]
+    nominal = load_text(tmp_path, text)
+    robot = draw_errors(nominal, 1)
+    reached = inverse(robot, sample_workspace(nominal, 100, seed=2).coordinates)
+    assert reached.converged.all()
+    assert_allclose(reached.q, measure(robot, reached.T), rtol=0, atol=1e-9)
+    there = forward(robot, measure(robot, reached.T))
+    assert there.converged.all()
+    assert_allclose(there.T, reached.T, rtol=0, atol=1e-9)
+    check_pose_derivatives(robot, there.q[None, :3])
+
+
+@pytest.mark.parametrize("name", REDUNDANT)
+def test_machines_with_redundant_sums_are_as_accurate_as_stated(tmp_path, name):
+    robot = load_text(tmp_path, REDUNDANT[name][0])
+    instrument = Instrument((Sensor(Pose("rotation-vector"), Gaussian(np.repeat(1e-5, 6))),))
+    poses, truth = sample_workspace(robot, 30, seed=1).coordinates, sample_truth(robot, 100, 2)
+    trials = simulate_trials(robot, truth, poses, instrument, 3)
+    fits = identify_trials(robot, trials, LeastSquares())
+    assert fits.converged.all()
+    error = (fits.values - truth) / fits.standard_deviations()
+    # squares of 100 draws have the mean 1 +- sqrt(2 / 100), 3 times that
+    assert_allclose((error**2).mean(axis=0), 1.0, rtol=0, atol=3 * np.sqrt(2 / 100))
+    before = (np.median(np.abs(a - truth), axis=0) for a in (robot.values, fits.values))
+    assert np.less(*list(before)[::-1]).all()
+
+
+def test_redundant_sums_that_contradict_each_other_open_a_little(tmp_path: Path) -> None:
+    """By standard deviations of the readings, where these are known: the worst one gives way."""
+    text = WINCHES
+    for name, sigma in (("w1: {", 1e-6), ("w2: {", 2e-5), ("w3: {", 1e-3)):
+        text = text.replace(name, f"{name}sigma: {sigma}, ")
+    robot = load_text(tmp_path, text)
+    q = measure_winches(robot, robot.home[None])
+    solved = forward(robot, q + [0, 0, 1e-3])
+    assert solved.converged.all()
+    assert np.abs(solved.T - robot.home).max() < 1e-8
+    moved = forward(robot, q + [1e-3, 0, 0]).T[0, :3, 3] - robot.home[:3, 3]
+    with_two = np.linalg.solve([[0.85, -0.7], [-0.85, -0.7]], [1e-3 * np.hypot(0.85, 0.7), 0])
+    assert_allclose(moved[[0, 2]], with_two, rtol=0, atol=3e-6)
+
+
+@pytest.mark.parametrize(
+    "new",
+    ["h: {reads: length}\n  k: {reads: length}", f"{THIRD}\n  m: {{reads: length}}\n  k: {{reads: length}}"],
+    ids=["as many as joints", "more than joints"],
+)  # fmt: skip
+def test_a_plate_with_readings_and_sums_is_redundant(tmp_path: Path, new: str) -> None:
+    robot = load_text(tmp_path, PLATE.replace(THIRD, new))
+    y = np.random.default_rng(3).uniform(-0.2, 0.2, (20, 3))
+    there = inverse(robot, y)
+    plain = inverse(load_text(tmp_path, PLATE), y)
+    assert_array_equal(there.q[:, :2], plain.q[:, :2])
+    assert_allclose(forward(robot, there.q).T, plain.T, rtol=0, atol=1e-11)
 
 
 SPLINE = """format: 1
