@@ -188,7 +188,7 @@ def measure_sums(robot: Mechanism, weights: FloatArray) -> FloatArray:
     with np.errstate(divide="ignore"):
         lengths = (1.0 / (np.abs(weights[0]) / units).max(axis=1)).clip(max=1e12)
     readings = np.array([row.column is None for row in robot.assembly.rows[-len(lengths) :]])
-    if robot.has_open_sums and robot.program.may_stay_open and readings.any():
+    if robot.has_redundant_sums and readings.any():
         rows = [row for row in robot.assembly.rows if row.column is None]
         sigma = [(row.sigma or 0.0) * abs(row.terms.get("gain", 1.0)) for row in rows]
         own = 1.0 / np.array(sigma) if all(sigma) else lengths[readings]

@@ -512,7 +512,7 @@ def _build_stages(attached: Sequence[AttachedStage]) -> tuple[Stage, ...]:
             robot = _compile(stage.assembly)
         except MechanismError as error:
             raise MechanismError(f"stage {stage.name!r}: {error}") from None
-        if robot.program.sigma is not None:
+        if robot.program.sigma is not None or robot.has_redundant_sums:
             raise MechanismError(
                 f"stage {stage.name!r} has {len(robot.actuators)} actuators for "
                 f"{len(robot.freedoms)} freedoms; a stage of a chain must have one actuator for "

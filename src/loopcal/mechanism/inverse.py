@@ -148,7 +148,7 @@ def moves_by_drives(robot: Mechanism) -> bool:
     close no loop, joints with a shared drive and coupled ones would part, and an actuator of loops
     that may stay open would take a part of the gap.
     """
-    is_open = robot.program.may_stay_open and robot.assembly.closure != "exact"
+    is_open = robot.program.may_stay_open and not robot.has_redundant_sums
     is_bound = robot.program.shared_drive_count > 0 or bool(robot.assembly.couplings)
     return bool(robot.stages) or is_open or is_bound
 

@@ -385,6 +385,13 @@ class Mechanism(DrawnResult):
         is_square = self.program.n_joints == len(rows) and readings <= len(self.freedoms)
         return self.has_sums and not self.stages and not is_square
 
+    @property
+    def has_redundant_sums(self) -> bool:
+        """Whether sums are more than the freedoms: loops may stay open, but no file asks for it."""
+        return (
+            self.has_open_sums and self.program.may_stay_open and self.assembly.closure == "exact"
+        )
+
     @cached_property
     def all_parameters(self) -> ParameterUnits:
         """All parameters in SI, as columns of derivatives."""

@@ -666,17 +666,17 @@ def test_redundant_sums_that_contradict_each_other_open_a_little(tmp_path: Path)
         text = text.replace(name, f"{name}sigma: {sigma}, ")
     robot = load_text(tmp_path, text)
     q = measure_winches(robot, robot.home[None])
-    solved = forward(robot, q + [0, 0, 1e-3])
+    solved = forward(robot, q + np.array([0, 0, 1e-3]))
     assert solved.converged.all()
     assert np.abs(solved.T - robot.home).max() < 1e-8
-    moved = forward(robot, q + [1e-3, 0, 0]).T[0, :3, 3] - robot.home[:3, 3]
+    moved = forward(robot, q + np.array([1e-3, 0, 0])).T[0, :3, 3] - robot.home[:3, 3]
     with_two = np.linalg.solve([[0.85, -0.7], [-0.85, -0.7]], [1e-3 * np.hypot(0.85, 0.7), 0])
     assert_allclose(moved[[0, 2]], with_two, rtol=0, atol=3e-6)
 
 
 @pytest.mark.parametrize(
     "new",
-    ["h: {reads: length}\n  k: {reads: length}", f"{THIRD}\n  m: {{reads: length}}\n  k: {{reads: length}}"],
+    ["h: {reads: length}\n  k: {reads: length}", f"{THIRD}\n  m: {{reads: length}}\n  k: {{reads: length}}"],  # noqa: E501
     ids=["as many as joints", "more than joints"],
 )  # fmt: skip
 def test_a_plate_with_readings_and_sums_is_redundant(tmp_path: Path, new: str) -> None:
@@ -686,6 +686,8 @@ def test_a_plate_with_readings_and_sums_is_redundant(tmp_path: Path, new: str) -
     plain = inverse(load_text(tmp_path, PLATE), y)
     assert_array_equal(there.q[:, :2], plain.q[:, :2])
     assert_allclose(forward(robot, there.q).T, plain.T, rtol=0, atol=1e-11)
+    with pytest.raises(FileError, match="a stage of a chain must have one actuator for"):
+        load_text(tmp_path, CELL.replace(THIRD, new.replace("\n", "\n    ")))
 
 
 SPLINE = """format: 1
