@@ -90,7 +90,9 @@ def test_reused_anchor_counts_its_latest_value(tmp_path) -> None:
     assert read_yaml(write(tmp_path, nested), "robot file").content["z"] == [[2, 2], [2, 2]]
 
 
-@pytest.mark.parametrize("text", ["a: " + "[" * 60 + "]" * 60, "a: " + "{b: " * 60 + "}" * 60])
+@pytest.mark.parametrize(
+    "text", ["a: " + "[" * 60 + "]" * 60, "a: " + "{b: " * 60 + "}" * 60, "a: " + "[" * 5000]
+)
 def test_deep_nesting_is_refused_at_its_line(tmp_path, text: str) -> None:
     with pytest.raises(FileError, match=r"yaml:2: .* more than 50 levels of nesting"):
         read_yaml(write(tmp_path, f"name: x\n{text}\n"), "robot file")

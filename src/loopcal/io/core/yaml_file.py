@@ -124,9 +124,12 @@ def _load_content(
         raise FileError(error.refusal, path, line) from None
     except MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
+        line = mark.line + first_line if mark else None
+        if "max_depth" in str(error.problem):
+            raise YAML_DEPTH.make_error(what, path, line=line) from None
         problem = _shorten(error.problem or error.context or "not YAML")
         sentence = f"not valid YAML ({problem}). Check indentation, brackets and colons"
-        raise FileError(sentence, path, mark.line + first_line if mark else None) from None
+        raise FileError(sentence, path, line) from None
     except RecursionError:
         raise YAML_DEPTH.make_error(what, path) from None
     except (YAMLError, ValueError, LookupError, AssertionError) as error:
@@ -143,6 +146,7 @@ def _compose(text: str) -> Any:
     """
     yaml = make_yaml()
     yaml.composer.warn_double_anchors = False  # YAML allows an anchor again, for another value
+    yaml.max_depth = YAML_DEPTH.count  # deep text takes the square of its depth to read
     return yaml.compose(text)
 
 
