@@ -95,10 +95,12 @@ def test_wrong_row_and_moved_target_are_named() -> None:
     result = lc.check_up(run, {"new": replace(data, observations=(replace(rows, measured=wrong),))})
     assert result.findings[0].code == "checks.wrong-pose"
     assert result.findings[0].data["pose"] == data.labels[2]
+    assert not result.cause
     moved = measure(run.robot, truth, 5, 71, moved=1e-3)
     result = lc.check_up(run, {"new": moved})
     assert result.findings[0].code == "checks.setup-moved"
     assert result.findings[0].data["names"] == ("a",)
+    assert not result.cause
     assert not lc.check_up(run, {"new": moved}, refit=("a",)).moved
 
 
@@ -138,6 +140,17 @@ def test_checks_may_measure_different_quantities() -> None:
     assert result.plot().axes
 
 
+def test_poses_without_values_do_not_count() -> None:
+    run, truth = calibrate(1)
+    data = measure(run.robot, truth, 6, 86)
+    (rows,) = data.observations
+    part = replace(data, observations=(rows.take(rows.rows < 4),))
+    (check,), (same,) = (
+        lc.check_up(run, {"one": d}).checks for d in (part, data.take(np.arange(4)))
+    )
+    assert (check.poses, check.p_value) == (4, pytest.approx(same.p_value, rel=1e-9))  # rounding
+
+
 def test_a_failed_calibration_does_not_hold() -> None:
     run, truth = calibrate(1)
     data = {"one": measure(run.robot, truth, 5, 85)}
@@ -167,4 +180,7 @@ def test_planned_checks_run_from_the_command_line(tmp_path, monkeypatch, capsys)
     fill = "--fill check/measurements.csv --draw-errors --seed 5"
     call(f"simulate linear-delta {fill} -o other.csv")
     assert "has changed" in call("check-up run week-1.csv other.csv", code=2)
+    text = Path("other.csv").read_text("utf-8")
+    Path("other.csv").write_text(text.replace("robot: linear-delta", "robot: its-twin"), "utf-8")
+    assert "but the run is of 'linear-delta'" in call("check-up run other.csv", code=1)
     assert "Leave out --curve" in call(f"{plan} -o again --curve", code=1)

@@ -27,7 +27,9 @@ FRAME = re.compile(r'File "[^"]*?/src/(loopcal/[^"]+)", line (\d+), in (\S+)')
 MESSAGE = re.compile(r"^(loopcal: |Hint: |  )")
 ARCHIVES_AND_PICTURES = (b"\x89PNG", b"%PDF", b"PK", b"SQLite format 3")
 """First bytes of files that are no text."""
-SECONDS = re.compile(r"(?:in|takes|about) [\d.e-]+ s\b|\"(?:worker_)?seconds(?:_per_\w+)?\": [\d.e-]+")
+SECONDS = re.compile(
+    r"(?:in|takes|about) [\d.e-]+ s\b|\"(?:worker_)?seconds(?:_per_\w+)?\": [\d.e-]+"
+)
 """How long a study took, which differs from run to run."""
 LOGS = (".sqlite-shm", ".sqlite-wal")
 """Files that SQLite makes beside a store, also to read it."""

@@ -41,7 +41,7 @@ from loopcal.measure.kinds.kind import SCALES
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.readings import fill_in_reading_sigma
 from loopcal.numerics.elimination import eliminate_columns
-from loopcal.numerics.statistics import compute_f_tail
+from loopcal.numerics.statistics import compute_f_tail, find_distinct
 from loopcal.results.description import Field, each, fields, label_axes, pick
 from loopcal.results.result import DrawnResult
 from loopcal.results.tables import Column, build_table, choose_unit, format_in
@@ -93,7 +93,8 @@ class CheckUp(DrawnResult):
     checks : see `Check`. false_alarms : probability of any false alarm within a year of `a_year`
         checks. refitted : frames and other setup that each check determines for itself.
     units : of each quantity, in which its error is shown.
-    cause : parameters or limbs that explain the change of the newest check, if any.
+    cause : parameters or limbs whose change explains the newest check; empty where the machine has
+        not changed, or where a pose or setup explains it.
     findings : whether the machine has changed, by the newest check.
     """
 
@@ -203,7 +204,9 @@ def check_up(
     notes: list[Finding] = []
     data = judged = None
     refit, seen = tuple(sorted(match_owners(refit, *checks.values()))), FittedRows()
-    for name, data in checks.items():
+    for name, given in checks.items():
+        poses = np.concatenate([np.zeros(0, int), *(o.rows.ravel() for o in given.observations)])
+        data = given.take(find_distinct(poses)) if poses.size else given  # those with a value
         reused = report_reused_rows(run.fitted_rows, data)
         notes += [] if reused is None else [reused]
         again = seen.find_in(data)
@@ -235,10 +238,9 @@ def check_up(
         code = "checks.machine-changed" if last.together else "checks.unexplained"
         other = _explain_otherwise(last.name, data, rows[-1].kept, test, level)
         finding = other or report_finding(code, **said)
-    return CheckUp(
-        tuple(done), false_alarms, a_year, rows[-1].refitted, units, judged.cause.names,
-        (finding, *notes),
-    )  # fmt: skip
+    cause = judged.cause.names if finding.code == "checks.machine-changed" else ()
+    findings = (finding, *notes)
+    return CheckUp(tuple(done), false_alarms, a_year, rows[-1].refitted, units, cause, findings)
 
 
 def _collect_rows(

@@ -25,6 +25,7 @@ import click
 import loopcal as lc
 from loopcal.cli import terminal
 from loopcal.errors import DataError, LoopcalError, UnitError, suggest_names
+from loopcal.findings import report_finding
 from loopcal.registry import Registry
 from loopcal.units import Dimension, find_unit, parse_number, parse_quantity
 
@@ -479,12 +480,12 @@ def open_robot(
 
 
 def read_measurements(
-    paths: Sequence[Path], robot: lc.Mechanism, **allowed: bool
+    paths: Sequence[Path], robot: lc.Mechanism, *, is_check: bool = False, **allowed: bool
 ) -> lc.Measurements:
     """Read measurement files as one set.
 
-    Print a note where a file names another robot, or another file by its absolute path, or contains
-    no measured value.
+    Print a note where a file names another robot, which is refused where it `is_check` of a run, or
+    another file by its absolute path, or contains no measured value.
     """
     from loopcal.diagnose.conventions.convention_check import explain_outside_strokes
     from loopcal.io.core.yaml_file import list_absolute_references
@@ -498,7 +499,9 @@ def read_measurements(
             terminal.print_note(finding)
         stated = str(settings.content.get("robot") or "").strip()
         if stated not in ("", robot.name):
-            facts = {"file": str(path), "stated": stated, "used": robot.name}
+            facts: Any = {"file": str(path), "stated": stated, "used": robot.name}
+            if is_check:
+                raise DataError(report_finding("checks.other-robot", **facts))
             terminal.print_finding("workflow.robot-of-other-name", **facts)
     try:
         with terminal.TerminalProgress("reading the measurements"):

@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -66,10 +66,13 @@ class ObservationRows:
         """Return some rows with poses renumbered: pose i becomes place[i]."""
         if len(rows) == len(self.poses):
             return replace(self, poses=place[self.poses])
-        selected = (self.measured[:, rows], self.whitener[:, rows], self.nuisance[rows])
-        factor = None if self.factor is None else self.factor[rows]
-        offset = None if self.offset is None else self.offset[:, rows]
-        return ObservationRows(self.kind, place[self.poses[rows]], *selected, factor, offset)
+        at: Any = rows
+        if len(rows) and (np.diff(rows) == 1).all():  # a run of rows is not copied
+            at = slice(int(rows[0]), int(rows[-1]) + 1)
+        selected = (self.measured[:, at], self.whitener[:, at], self.nuisance[at])
+        factor = None if self.factor is None else self.factor[at]
+        offset = None if self.offset is None else self.offset[:, at]
+        return ObservationRows(self.kind, place[self.poses[at]], *selected, factor, offset)
 
     def divided(self) -> ObservationRows:
         """Return the rows of each target on its own, (r k, ..), where the noise allows it: they

@@ -292,7 +292,9 @@ def check_up(
         refuse_outputs((output,), (run, *checks), force)
     calibrated = lc.load_run(run)
     data = {
-        str(file): opt.read_checked_measurements((file,), calibrated.robot, **allowed)
+        str(file): opt.read_checked_measurements(
+            (file,), calibrated.robot, is_check=True, **allowed
+        )
         for file in checks
     }
     with terminal.TerminalProgress("comparing the checks"):
