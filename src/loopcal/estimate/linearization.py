@@ -32,7 +32,7 @@ from loopcal.estimate.smooth_errors import SmoothErrors
 from loopcal.measure.kinds.kind import Evaluation
 from loopcal.measure.readings import select_joint_values
 from loopcal.mechanism.actuation import DrivenJoints
-from loopcal.mechanism.kinematics import close_loops
+from loopcal.mechanism.kinematics import drive_loops
 from loopcal.mechanism.sensitivity import differentiate_pose, differentiate_sensed_values
 from loopcal.mechanism.states import Status
 from loopcal.numerics.elimination import spread_columns, without_rounding
@@ -220,8 +220,8 @@ def linearize_closure(
 ) -> LinearizedPoses:
     """Linearize the loop closure at given poses T (a, n, 4, 4), without solving it."""
     robot = free.robot
-    begin = replace(robot.home_state, T=T)
-    state = close_loops(robot, values, readings, begin, 1)
+    loops, joints = drive_loops(robot, values, readings)
+    state = loops.solve(joints, replace(robot.home_state, T=T), max_iterations=1)
     step = geometry.pose_difference(state.T, T)
     given_state = replace(state, T=T, status=np.zeros_like(state.status))
     D = differentiate_pose(robot, values, readings, given_state, free.columns).parameters

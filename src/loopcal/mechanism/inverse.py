@@ -2,9 +2,8 @@
 """Inverse kinematics of many trials: readings that lead to coordinates, as engine states (t, n).
 
 Where the controlled coordinates determine each limb, every actuator is free, and the engine closes
-the limbs. Where one actuator drives joints of several limbs, as a carriage with two rods does, the
-joints would part; a chain of stages has no loop through its base. There Newton's method on the
-driven joints, c(T(u)) = c*, uses forward kinematics. Source: docs/theory/kinematics.md,
+the limbs; others are closed together with the coordinates. A chain of stages has no loop through
+its base. There Newton's method on the driven joints, c(T(u)) = c*, uses forward kinematics. Source:
 docs/theory/kinematics.md.
 """
 
@@ -97,42 +96,38 @@ def _close_with_free_actuators(
     start: State | None,
     max_iterations: int = ITERATIONS,
 ) -> State:
-    """Return states (t, n) at controlled coordinates, all actuated joints free, from `start`; with
-    shared drives, other coordinates are those of the start.
+    """Return states (t, n) at controlled coordinates, all actuated joints free, from `start`; those
+    with a shared drive, and coupled ones, stay together.
     """
-    e, _ = robot.slots(values)
-    names, size, is_shared = robot.controlled, robot.size, robot.program.shared_drive_count > 0
-    T = pose_from_coordinates(target, names, begin.T if is_shared else robot.home)
-    guess = driven_values(robot.program, begin)
-    if is_shared:
-        names, start = tuple(ANGLES.get(f, f) for f in robot.freedoms), replace(begin, T=T)
-        target = read_coordinates(T, names)
-    elif determine_platform(robot):
+    (e, _), guess = robot.slots(values), driven_values(robot.program, begin)
+    if determine_platform(robot):
         limbs = robot.program.with_fixed_platform
-        start = replace(begin, T=T)
+        start = replace(begin, T=pose_from_coordinates(target, robot.controlled, robot.home))
         return engine.solve(limbs, e, guess, start, free=True, max_iterations=max_iterations)
     t, n = max(len(values), len(target)), target.shape[1]
     flat = np.broadcast_to(target, (t, n, target.shape[2])).reshape(t * n, -1)
 
     def command(T: FloatArray, rows: np.ndarray) -> tuple[FloatArray, FloatArray]:
-        return compare_coordinates(T, flat[rows], names, size)
+        return compare_coordinates(T, flat[rows], robot.controlled, robot.size)
 
-    T = np.broadcast_to(T if start is None else start.T, (t, n, 4, 4))
-    begin = replace(begin, T=T)
+    T = pose_from_coordinates(target, robot.controlled, robot.home) if start is None else start.T
+    begin, own, J = replace(begin, T=np.broadcast_to(T, (t, n, 4, 4))), None, robot.program.n_joints
     if robot.assembly.couplings:
         sums = list_open_sums(robot, values)
         own = scale_sums(robot, sums.weights[:, sums.chosen :], sums.fixed)
-        given = begin, command, False, max_iterations
-        return engine.solve(robot.program, e, guess, *given, sums=own)
-    guess = np.broadcast_to(guess, (t, n, robot.program.n_joints))
-    return engine.solve(robot.program, e, guess, begin, command, True, max_iterations)
+    elif robot.program.shared_drive_count:
+        own = engine.Sums(np.zeros((1, 0, J)), np.zeros((1, n, 0)))  # of which none is given
+    guess = np.broadcast_to(guess, (t, n, J))
+    given = begin, command, own is None, max_iterations
+    return engine.solve(robot.program, e, guess, *given, sums=own)
 
 
 def determine_platform(robot: Mechanism) -> bool:
     """Return whether the controlled coordinates state the whole pose, and each limb has as many
-    unknown joints as equations.
+    unknown joints as equations, none of which other limbs have.
     """
-    if robot.assembly.couplings or not robot.program.has_square_limbs:
+    is_bound = bool(robot.assembly.couplings) or robot.program.shared_drive_count > 0
+    if is_bound or not robot.program.has_square_limbs:
         return False
     if len(robot.controlled) == 6:
         return True
@@ -145,12 +140,10 @@ def determine_platform(robot: Mechanism) -> bool:
 
 def moves_by_drives(robot: Mechanism) -> bool:
     """Return whether inverse kinematics solves for the drives: each freed, those of a chain would
-    close no loop, joints with a shared drive and coupled ones would part, and an actuator of loops
-    that may stay open would take a part of the gap.
+    close no loop, and an actuator of loops that may stay open would take a part of the gap.
     """
     is_open = robot.program.may_stay_open and not robot.has_redundant_sums
-    is_bound = robot.program.shared_drive_count > 0 or bool(robot.assembly.couplings)
-    return bool(robot.stages) or is_open or is_bound
+    return bool(robot.stages) or is_open
 
 
 # A sphere that the platform cannot leave, from the lengths of the links.

@@ -316,24 +316,6 @@ def solve_serial(
     )
 
 
-def close_loops(
-    robot: Mechanism,
-    values: FloatArray,
-    q: FloatArray,
-    begin: State,
-    max_iterations: int = ITERATIONS,
-) -> State:
-    """Return the states (t, n) at readings q by Newton's method alone from `begin`, in any mode."""
-    if robot.stages:
-        states = [
-            close_loops(own.stage.robot, own.values, own.readings, own.state, max_iterations)
-            for own in each_stage(robot, values, begin, q)
-        ]
-        return join_stage_states(robot, states)
-    loops, driven = drive_loops(robot, values, q)
-    return loops.solve(driven, begin, None, max_iterations)
-
-
 def find_directly_reachable(robot: Mechanism, values: FloatArray, q: FloatArray) -> BoolArray:
     """Return which readings q (t | 1, n, a) are solved from home without following a path, on
     home's side of every singularity, (t, n).

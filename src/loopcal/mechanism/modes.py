@@ -21,7 +21,7 @@ from loopcal.errors import DataError, MechanismError
 from loopcal.mechanism.assembly import BASE
 from loopcal.mechanism.chains import has_spare_drives, join_stage_states
 from loopcal.mechanism.inverse import inverse_trials
-from loopcal.mechanism.kinematics import close_loops, compute_readings
+from loopcal.mechanism.kinematics import compute_readings, forward_trials
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.solutions import Solution, make_solution
 from loopcal.mechanism.states import Status, driven_values, join_states, make_start, select_poses
@@ -115,7 +115,9 @@ def find_assembly_modes(
     values = robot.values[None]
 
     def solve(start: State) -> State:
-        return close_loops(robot, values, readings[None, None], start)
+        state = forward_trials(robot, values, readings[None, None], start, follow=False)
+        is_other = state.status == Status.OTHER_MODE.value
+        return replace(state, status=np.where(is_other, np.int8(Status.CONVERGED), state.status))
 
     def measure(state: State) -> FloatArray:
         home = np.broadcast_to(robot.home, state.T[0].shape)
@@ -159,7 +161,7 @@ def find_working_modes(
 
     def solve(start: State) -> State:
         if robot.stages:  # a chain moves from a closed start
-            start = close_loops(robot, values, read(start)[None], start)
+            start = forward_trials(robot, values, read(start)[None], start, follow=False)
         reached = begun.status[0, 0] == Status.CONVERGED
         T = np.broadcast_to(begun.T, start.T.shape) if reached else start.T
         everywhere = np.broadcast_to(wanted, (1, T.shape[1], len(wanted)))
