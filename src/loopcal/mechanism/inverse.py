@@ -16,22 +16,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loopcal import engine, geometry
-from loopcal.engine import BASE, CONVERGED, EXHAUSTED, NOT_FINITE, PITCH, PLATFORM, STALLED, State
+from loopcal.engine import CONVERGED, EXHAUSTED, NOT_FINITE, STALLED, State
 from loopcal.mechanism.actuation import OpenSums, list_open_sums, scale_sums
 from loopcal.mechanism.chains import (
     find_carrying_actuators,
     has_spare_drives,
     join_stage_states,
-    list_carrying_stages,
     locate_stage_bases,
     split_stage_states,
     transport_twists,
 )
 from loopcal.mechanism.kinematics import Loops, compute_closure_sign, solve_serial
-from loopcal.mechanism.limb_rows import measure_rod, move_serial, place_links, place_serial
+from loopcal.mechanism.limb_rows import move_serial, place_serial
 from loopcal.mechanism.model import Mechanism, Stage
 from loopcal.mechanism.platform_coordinates import (
-    POSITION,
     compare_coordinates,
     pose_from_coordinates,
     read_coordinates,
@@ -144,53 +142,6 @@ def moves_by_drives(robot: Mechanism) -> bool:
     """
     is_open = robot.program.may_stay_open and not robot.has_redundant_sums
     return bool(robot.stages) or is_open
-
-
-# A sphere that the platform cannot leave, from the lengths of the links.
-
-ROUNDING = 1e-9  # excess, relative to the robot's size, of a target at the bound itself
-
-
-def bound_platform(robot: Mechanism, values: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return center (t, 3) and radius (t,) of a sphere around all positions of the platform [m].
-
-    values : (t, p). The radius is infinite where no limb bounds it.
-    """
-    whole, first = np.zeros(len(values)), np.zeros((len(values), 3))
-    for number, i in enumerate(list_carrying_stages(robot)):
-        stage = robot.blocks[i]
-        center, radius = _bound_by_limbs(stage.robot, values[:, stage.parameters])
-        center = center @ stage.mount[:3, :3].T + stage.mount[:3, 3]
-        if number:  # both turn with the platform before
-            whole = whole + np.linalg.norm(center, axis=1)
-        else:
-            first = center
-        whole = whole + radius
-    return first, whole
-
-
-def _bound_by_limbs(robot: Mechanism, values: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the smallest sphere (t, 3), (t,) about the first joint of a limb."""
-    center, radius = np.zeros((len(values), 3)), np.full(len(values), np.inf)
-    is_exact = robot.is_serial or (robot.program.is_square and not robot.program.may_stay_open)
-    if not is_exact:  # loops of redundant actuators, among others, may stay open
-        return center, radius
-    e, _ = robot.slots(values)
-    for group in robot.program.groups:
-        displacements = e[:, group.columns].reshape(len(e), len(group.limbs), -1)
-        for k in range(len(group.limbs)):
-            if (group.on[k], group.to[k]) != (BASE, PLATFORM):
-                continue
-            slides = "P" in group.joints or bool(group.pitch[k].any()) or group.actuator[-1, k] >= 0
-            if slides or any(slot.axis == PITCH for slot in group.slots):
-                continue  # a joint changes the distance of its neighbors
-            origins = place_links(group, k, displacements[:, k])[0][..., :3, 3]
-            length = np.linalg.norm(origins[:, 1:], axis=-1).sum(axis=1)
-            length = length + measure_rod(group, k, displacements[:, k])
-            shorter = length < radius
-            center = np.where(shorter[:, None], origins[:, 0], center)
-            radius = np.where(shorter, length, radius)
-    return center, radius
 
 
 # Inverse kinematics by the forward one: Newton's method on the driven joints, c(T(u)) = c*.
@@ -458,7 +409,7 @@ def _solve_by_drives(
     first = begin.select((t, n), *np.divmod(np.arange(t * n), n))
     start = _begin(rows, first)
     rows = replace(rows, sign=start.sign)
-    last = _solve_within_reach(rows, start, first, follow)
+    last = _solve_rows(rows, start, first, follow)
     status = np.where(np.isfinite(wanted).all(axis=1), last.status, np.int8(NOT_FINITE))
     state = rows.join_states(last)
     left = np.linalg.norm(
@@ -543,26 +494,11 @@ def _begin(rows: _Rows, first: State) -> _Iterate:
     return rows.evaluate(u, tuple(loops))
 
 
-def _solve_within_reach(rows: _Rows, start: _Iterate, first: State, follow: bool) -> _Iterate:
-    """Return the last iterates of rows from their start, the state `first`; rows with a target
-    beyond what the links span stay at the start.
-    """
-    robot, names = rows.robot, rows.robot.controlled
-    center, radius = bound_platform(robot, rows.values)
-    # coordinates of the position that are not controlled are free
-    columns = [i for i, name in enumerate(names) if name in POSITION]
-    axes = [POSITION.index(names[i]) for i in columns]
-    far = np.linalg.norm(rows.target[:, columns] - center[:, axes], axis=1)
-    is_near = far <= radius + ROUNDING * robot.size
-    solved = replace(start, status=np.full_like(start.status, STALLED))
-    near = np.flatnonzero(is_near)
-    if not len(near):
-        return solved
-    own, begin = rows.select(near), start.take(near)
-    if not robot.stages:
-        begin = _begin_near_targets(own, begin, map_arrays(lambda a: a[near], first))
-    solved = solved.put(near, own.iterate(begin))
-    wrong = near[solved.status[near] != CONVERGED]
+def _solve_rows(rows: _Rows, start: _Iterate, first: State, follow: bool) -> _Iterate:
+    """Return the last iterates of rows from their start, the state `first`."""
+    begin = start if rows.robot.stages else _begin_near_targets(rows, start, first)
+    solved = rows.iterate(begin)
+    wrong = np.flatnonzero(solved.status != CONVERGED)
     if not (follow and len(wrong)):
         return solved
     return solved.put(wrong, _follow_path(rows.select(wrong), start.take(wrong)))
