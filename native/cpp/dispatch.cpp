@@ -26,7 +26,7 @@ extern const loopcal::Kernels kernels;
 
 namespace {
 
-constexpr int ABI = 10;  // changes with every change of the C interface; library.py states it, too
+constexpr int ABI = 11;  // changes with every change of the C interface; library.py states it, too
 
 struct Set {
     const char *name;
@@ -106,11 +106,11 @@ EXPORT int loopcal_fold_compared(int set, const int64_t *structure, const double
                                  const loopcal::Strided *joints,
                                  const loopcal::ComparedPoses *measured,
                                  const loopcal::SolvedPoses *solved, const double *factor,
-                                 double *out, int8_t *is_finite, int64_t n,
-                                 int64_t max_iterations) {
+                                 int8_t *is_finite, int64_t n, int64_t max_iterations,
+                                 loopcal::Steps *steps) {
     return list_sets()[set].kernels->fold_compared(structure, numbers, entries, arrays, joints,
-                                                   measured, solved, factor, out, is_finite, n,
-                                                   max_iterations);
+                                                   measured, solved, factor, is_finite, n,
+                                                   max_iterations, steps);
 }
 
 EXPORT int loopcal_compare_poses(int set, const loopcal::Strided *arrays, double *residual,

@@ -53,13 +53,35 @@ struct ComparedPoses {
     const double *reference, *whitener;
 };
 
+// Moves e, q and the numbers of the map to a deviation (p,); a value other than 0 ends the call.
+typedef int (*Move)(const double *deviation);
+
+// Full Gauss-Newton steps of one trial, see loopcal.engine.Steps. e, q : what `arrays` are read from.
+// displacements (count, 2), joints (joint_count, 3) : pairs and triples of the map, by which e and q
+// move without `move`. penalty : (height, p). sign : (n,) that poses must keep.
+// Results: `taken` steps, -1 where the first poses cannot be used, deviations (most + 1, p), costs
+// (most + 1,), and the change of the residuals by the last step.
+struct Steps {
+    int64_t most, height, count, joint_count;
+    double widest, relative, absolute, further, slowest, accepted, rounding, singular;
+    const double *penalty;
+    const int8_t *sign;
+    const int64_t *displacements, *joints;
+    double *e, *q;
+    Move move;
+    double *deviation, *cost;
+    double change;
+    int64_t taken;
+};
+
 // T (n, 4, 4), joints as of the start, and (n,): residual, iterations, status, sign. strided : the
-// joints again, as input.
+// joints again, as input. factor : (p + 1, p + 1).
 struct SolvedPoses {
     double *T, *const *joints, *residual;
     int64_t *iterations;
     int8_t *status, *sign;
     const Strided *strided;
+    double *factor;
 };
 
 struct Kernels {
@@ -86,8 +108,8 @@ struct Kernels {
     // arrays : e, q, T of the start and the numbers of the map; see compared.h
     int (*fold_compared)(const int64_t *structure, const double *numbers, const int64_t *entries,
                          const Strided *arrays, const Strided *joints, const ComparedPoses *measured,
-                         const SolvedPoses *solved, const double *factor, double *out,
-                         int8_t *is_finite, int64_t n, int64_t max_iterations);
+                         const SolvedPoses *solved, const double *factor, int8_t *is_finite,
+                         int64_t n, int64_t max_iterations, Steps *steps);
     // arrays : see compare.h
     int (*compare_poses)(const Strided *arrays, double *residual, double *by_twist, int64_t t,
                          int64_t n);

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loopcal.engine import (
+    Advanced,
     Block,
     ClosureBlocks,
     ComparedPoses,
@@ -19,6 +20,7 @@ from loopcal.engine import (
     Program,
     Reached,
     State,
+    Steps,
     Sums,
     Target,
     Task,
@@ -54,9 +56,10 @@ from loopcal_native.library import (
     require_done,
 )
 from loopcal_native.library import ComparedPoses as ComparedPosesOfLibrary
+from loopcal_native.library import Steps as StepsOfLibrary
 from loopcal_native.pose_rows import flatten_rows
 from loopcal_native.programs import flatten_program, require
-from loopcal_native.tasks import NO_TASK, TaskCalls
+from loopcal_native.tasks import NO_TASK, MoveCalls, TaskCalls
 from loopcal_native.version import VERSION
 
 MOST_STEPS = 60
@@ -363,54 +366,78 @@ class NativeFunctions:
         start: State,
         inputs: ParameterMap,
         measured: ComparedPoses,
-    ) -> tuple[State, FloatArray, BoolArray]:
-        """Close the loops of one trial, and fold the rows of its measured poses."""
+        steps: Steps,
+    ) -> Advanced:
+        """Close the loops of one trial, fold the rows of its poses, and take full steps."""
         n, flat = start.T.shape[1], flatten_program(program, False)
         entries, arrays, begin = flatten_inputs(program, e, q, start, inputs, (1, n))
-        width, (count, height) = inputs.pattern.parameters + 1, measured.whitener.shape[:2]
+        p, (count, height) = inputs.pattern.parameters, measured.whitener.shape[:2]
         factor, pose = as_reals(factor), np.ascontiguousarray(measured.poses, np.int64)
         reference, whitener = as_reals(measured.reference), as_reals(measured.whitener)
-        require(factor.shape == (1, width, width), f"a factor (1, {width}, {width})")
+        require(factor.shape == (1, p + 1, p + 1), f"a factor (1, {p + 1}, {p + 1})")
         require(start.T.shape == (1, n, 4, 4), "a start (1, n)")
         is_right = reference.shape == (count, 12) and whitener.shape == (count, height, 6)
         require(is_right and pose.shape == (count,), "measured poses (r,), (r, 12), (r, m, 6)")
         require(not count or (pose.min() >= 0 and pose.max() < n), f"poses of {n}")
         require(bool((pose[1:] >= pose[:-1]).all()), "poses in ascending order")
-        parts = [((1, n, *a.shape[2:]), float) for a in begin]
-        T, residual, iterations, status, sign, is_finite, out, *joints = allocate(
-            ((1, n, 4, 4), float),
-            ((1, n), float),
-            ((1, n), np.int64),
-            ((1, n), np.int8),
-            ((1, n), np.int8),
-            ((1, n), np.bool_),
-            (factor.shape, float),
-            *parts,
+        sign = np.array(np.broadcast_to(start.closure_sign, (1, n)), np.int8)
+        penalty = as_reals(steps.penalty)
+        is_right = penalty.shape == (len(penalty), p) or not penalty.size
+        require(
+            is_right and steps.deviation.shape == (p,), f"a penalty (k, {p}) and a deviation ({p},)"
         )
-        addresses, strided = list_addresses(joints), describe_all(joints)
-        outputs = [locate(a) for a in (residual, iterations, status, sign)]
-        lists = ctypes.addressof(addresses), ctypes.addressof(strided)
+        if steps.most:  # these move, and T, the third one, does not
+            arrays = [a if i == 2 else a.copy() for i, a in enumerate(arrays)]
+        parts: list[tuple[tuple[int, ...], type]] = [
+            *(((1, n, 4, 4), float), ((1, n), float), ((1, n), np.int64)),
+            *(((1, n), np.int8), ((1, n), np.int8), (factor.shape, float)),
+            *(((1, n, *a.shape[2:]), float) for a in begin),
+        ]
+        finite = ((1, n), np.bool_), ((steps.most + 1, p), float), ((steps.most + 1,), float)
+        is_finite, deviations, costs, *memory = allocate(*finite, *parts, *parts)
+        deviations[0] = steps.deviation
+        solved, kept = (SolvedPoses * 2)(), []
+        for i, own in enumerate((memory[: len(parts)], memory[len(parts) :])):
+            kept += [list_addresses(own[6:]), describe_all(own[6:])]
+            T, *others, out = (locate(a) for a in own[:6])
+            lists = (ctypes.addressof(a) for a in kept[-2:])
+            solved[i] = SolvedPoses(T, next(lists), *others, next(lists), out)
+        calls = MoveCalls(steps, [arrays[i] for i in (0, 1, 3, 4, 5)])
+        pattern = [
+            np.ascontiguousarray(a, np.int64)
+            for a in (inputs.pattern.displacements, inputs.pattern.joints)
+        ]
+        taken = StepsOfLibrary(
+            *(steps.most, len(penalty), *map(len, pattern), *steps.limits),
+            *(locate(a) for a in (penalty, sign, *pattern, *arrays[:2])),
+            calls.function,
+            *(locate(deviations), locate(costs), np.inf, -1),
+        )
         numbers = (locate(a) for a in (pose, reference, whitener))
-        require_done(
-            load_library().loopcal_fold_compared(
-                self.instruction_set,
-                locate(flat.structure),
-                locate(flat.numbers),
-                locate(entries),
-                describe_all(arrays),
-                describe_all(begin),
-                ComparedPosesOfLibrary(count, height, *numbers),
-                SolvedPoses(locate(T), lists[0], *outputs, lists[1]),
-                locate(factor),
-                locate(out),
-                locate(is_finite),
-                n,
-                MOST_STEPS,
-            )
+        outcome = load_library().loopcal_fold_compared(
+            self.instruction_set,
+            locate(flat.structure),
+            locate(flat.numbers),
+            locate(entries),
+            describe_all(arrays),
+            describe_all(begin),
+            ComparedPosesOfLibrary(count, height, *numbers),
+            solved,
+            locate(factor),
+            locate(is_finite),
+            n,
+            MOST_STEPS,
+            taken,
         )
+        if outcome == TASK_FAILED:
+            raise calls.error
+        require_done(outcome)
+        last = len(parts) if taken.taken % 2 and taken.taken > 0 else 0
+        T, residual, iterations, status, sign, out, *joints = memory[last : last + len(parts)]
         groups = len(program.groups)
         others = status, residual, iterations, sign, tuple(joints[groups:])
-        return State(T, tuple(joints[:groups]), *others), out, is_finite
+        state, end = State(T, tuple(joints[:groups]), *others), taken.taken + 1
+        return Advanced(state, out, is_finite, deviations[:end], costs[:end], taken.change)
 
     def solve_triangles(
         self, triangle: FloatArray, right: FloatArray

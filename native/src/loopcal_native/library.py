@@ -11,7 +11,9 @@ from typing import Any
 
 import numpy as np
 
-ABI = 10
+from loopcal.engine import Limits
+
+ABI = 11
 """The C interface that this package calls; dispatch.cpp states it, too."""
 APART, CHAINED, ENDING = 0, 1, 2
 """Where `loopcal_solve` begins the poses of a trial; interface.h states it, too."""
@@ -53,7 +55,24 @@ class SolvedPoses(ctypes.Structure):
 
     _fields_ = tuple(
         (name, ADDRESS)
-        for name in ("T", "joints", "residual", "iterations", "status", "sign", "strided")
+        for name in ("T", "joints", "residual", "iterations", "status", "sign", "strided", "factor")
+    )
+
+
+MOVE = ctypes.CFUNCTYPE(INT, ADDRESS)
+
+
+class Steps(ctypes.Structure):
+    """Full Gauss-Newton steps, see interface.h."""
+
+    _fields_ = (
+        *((name, COUNT) for name in ("most", "height", "count", "joint_count")),
+        *((name, ctypes.c_double) for name in Limits._fields),
+        *((name, ADDRESS) for name in ("penalty", "sign", "displacements", "joints", "e", "q")),
+        ("move", MOVE),
+        *((name, ADDRESS) for name in ("deviation", "cost")),
+        ("change", ctypes.c_double),
+        ("taken", COUNT),
     )
 
 
@@ -102,7 +121,8 @@ def load_library() -> ctypes.CDLL:
     library.loopcal_fold_compared.argtypes = (INT, *(ADDRESS,) * 5)
     library.loopcal_fold_compared.argtypes += (ctypes.POINTER(ComparedPoses),)
     library.loopcal_fold_compared.argtypes += (ctypes.POINTER(SolvedPoses),)
-    library.loopcal_fold_compared.argtypes += (*(ADDRESS,) * 3, *(COUNT,) * 2)
+    library.loopcal_fold_compared.argtypes += (*(ADDRESS,) * 2, *(COUNT,) * 2)
+    library.loopcal_fold_compared.argtypes += (ctypes.POINTER(Steps),)
     library.loopcal_compare_poses.argtypes = (INT, *(ADDRESS,) * 3, *(COUNT,) * 2)
     library.loopcal_solve_triangles.argtypes = (INT, *(ADDRESS,) * 4, *(COUNT,) * 2)
     library.loopcal_solve.argtypes = (INT, *(ADDRESS,) * 4, *(COUNT,) * 3)

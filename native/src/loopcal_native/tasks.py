@@ -1,18 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Conditions on poses that are functions of Python, called by the library."""
+"""Conditions on poses, and inputs at other deviations, that are functions of Python."""
 
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from loopcal.engine import Task
-from loopcal_native.library import MOST_CONDITIONS, TASK, as_reals
+from loopcal.engine import Steps, Task
+from loopcal.typing import FloatArray
+from loopcal_native.library import MOST_CONDITIONS, MOVE, TASK, as_reals
 from loopcal_native.programs import require
 
-NO_TASK = TASK(0)
+NO_TASK, NO_MOVE = TASK(0), MOVE(0)
 
 
 class TaskCalls:
@@ -46,6 +48,33 @@ class TaskCalls:
         self._kept = residual, slopes
         answer[0].residual, answer[0].slopes = residual.ctypes.data, slopes.ctypes.data
         answer[0].conditions = residual.shape[1]
+        return 0
+
+
+class MoveCalls:
+    """Inputs e, q and those of a map at other deviations, as a function that the library calls once
+    for each step and that writes into these arrays.
+
+    function : for the library. error : what the caller's function raised.
+    """
+
+    def __init__(self, steps: Steps, arrays: Sequence[FloatArray]) -> None:
+        self.error: BaseException = RuntimeError("no inputs were asked for")
+        self._steps, self._arrays = steps, arrays
+        self.function = MOVE(self._write) if steps.move else NO_MOVE
+
+    def _write(self, deviation: int) -> int:
+        """Write the inputs at a deviation (p,); return 1 where the function fails."""
+        try:
+            assert self._steps.move is not None
+            z = _view(deviation, ctypes.c_double, len(self._steps.deviation)).copy()
+            e, q, at = self._steps.move(z)
+            moved = e, q, at.displacements, at.joints, at.basis
+            for array, other in zip(self._arrays, moved, strict=True):
+                np.copyto(array, other)
+        except BaseException as error:  # noqa: BLE001 - it must pass through the library
+            self.error = error
+            return 1
         return 0
 
 

@@ -405,6 +405,57 @@ class ComparedPoses:
     whitener: FloatArray
 
 
+class Limits(NamedTuple):
+    """Numbers by which full steps end.
+
+    widest : residual of closure up to which a pose counts as closed [m].
+    relative, absolute : a step is the last that changes the whitened residuals by this share of
+        their norm, and all further ones by `further` of it, as the ratio of the last two lets
+        expect, `slowest` at least from 1; or that is so long relative to 1 + |z|.
+    accepted : share of the predicted decrease that a step must bring, with `rounding` of the sum.
+    singular : share of |R| above which all singular values of R must certainly be.
+    """
+
+    widest: float
+    relative: float
+    absolute: float
+    further: float
+    slowest: float
+    accepted: float
+    rounding: float
+    singular: float
+
+
+class Steps(NamedTuple):
+    """Full Gauss-Newton steps of one trial, as many as `most`.
+
+    deviation : (p,) z of e, q and their map. penalty : (k, p) P of the penalty |P z|^2.
+    move : from z (p,) to e, q and their map; None where the map is the same everywhere.
+    """
+
+    deviation: FloatArray
+    penalty: FloatArray
+    most: int
+    limits: Limits
+    move: Callable[[FloatArray], tuple[FloatArray, FloatArray, ParameterMap]] | None = None
+
+
+class Advanced(NamedTuple):
+    """Where full steps end: what `fold_poses` returns with the state (1, n), and the way there.
+
+    deviations : (s + 1, p) of the s steps that were accepted, none where poses are not solved or
+        lie beyond a singularity. costs : (s + 1,) sums of squares. change : of the whitened
+        residuals by the last step; infinite without any.
+    """
+
+    state: State
+    factor: FloatArray
+    is_finite: NDArray[np.bool_]
+    deviations: FloatArray
+    costs: FloatArray
+    change: float
+
+
 @dataclass(frozen=True, eq=False)
 class TwistRows:
     """Whitened rows of poses, m of each of r measurements, as the platform's twist changes them.

@@ -20,12 +20,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loopcal.engine.program import (
+    Advanced,
     ClosureBlocks,
     ComparedPoses,
     ParameterMap,
     Program,
     Reached,
     State,
+    Steps,
     Sums,
     Target,
     Task,
@@ -80,7 +82,7 @@ class Engine:
     solve_triangles: Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]] | None = None
     compare_poses: Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]] | None = None
     follow: Callable[..., State] | None = None
-    fold_compared: Callable[..., tuple[State, FloatArray, BoolArray]] | None = None
+    fold_compared: Callable[..., Advanced] | None = None
 
     def __str__(self) -> str:
         return f"{self.name} {self.version}"
@@ -310,20 +312,19 @@ def fold_compared(
     start: State,
     inputs: ParameterMap,
     measured: ComparedPoses,
-) -> tuple[State, FloatArray, BoolArray] | None:
+    steps: Steps,
+) -> Advanced | None:
     """Close the loops of one trial and fold the rows of its measured poses: `solve` from a start
-    (1, n), `compare_poses`, and `fold_poses` of the whitened differences. Rows of poses that are
-    not solved are not defined.
+    (1, n), `compare_poses`, and `fold_poses` of the whitened differences. Then take full steps,
+    each to the least sum of squares with penalty of the linear model, as long as they are accepted
+    and not negligible. Rows of poses that are not solved are not defined.
 
-    Returns
-    -------
-    The state (1, n), and what `fold_poses` returns. None where the engine leaves this to these
-    functions.
+    None where the engine leaves this to these functions, and steps to `loopcal.estimate.descent`.
     """
     current = get_current_engine()
     if current.fold_compared is None or program.idle_groups:
         return None
-    return current.fold_compared(factor, program, e, q, start, inputs, measured)
+    return current.fold_compared(factor, program, e, q, start, inputs, measured, steps)
 
 
 def solve_triangles(

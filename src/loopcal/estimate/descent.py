@@ -10,19 +10,25 @@ makes no progress. See docs/theory/identification.md.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from numbers import Integral
 from typing import ClassVar, NamedTuple, Protocol, Self
 
 import numpy as np
 
-from loopcal.engine import fold
+from loopcal.engine import Advanced, Limits, Steps, fold
 from loopcal.errors import EstimationError
 from loopcal.estimate.linearization import Linearization, Start
 from loopcal.estimate.penalties import Method, decompose_for, fix_penalty
 from loopcal.measure.array_checks import check_type
-from loopcal.numerics.decomposition import RANK_TOLERANCE, Decomposition, solve_regular
+from loopcal.numerics.decomposition import (
+    RANK_TOLERANCE,
+    Decomposition,
+    certain_share,
+    solve_regular,
+)
 from loopcal.numerics.gauss_newton import ROUNDING, DescentStatus
 from loopcal.numerics.trial_batch import TrialBatch
 from loopcal.typing import BoolArray, FloatArray, IntArray, Progress, report_no_progress
@@ -372,22 +378,31 @@ def descend(
     progress(0, 1, "fitting")
     with np.errstate(over="ignore", invalid="ignore"):  # reported as a bad start
         begin = problem.start(z) if start is None else start
-        first = replace(_clear_failed(problem.linearize(z, begin)), deviation=z)
-    arrival = np.full(len(z), np.inf) if arrival is None else arrival
-    run = _Run(problem, method, tolerance, control, sufficient, first, arrival)
-    if ends_weak and method.unpenalized(z.shape[1]) is not None:
+        may_be_weak = ends_weak and method.unpenalized(z.shape[1]) is not None
+        is_plain = arrival is None and not (sufficient or control.damping or may_be_weak)
+        way = _advance(problem, z, begin, method, control, tolerance) if is_plain else None
+        first = way[0] if way else _linearize(problem, z, begin)
+    arrival = np.full(len(z), way[1].change if way else np.inf) if arrival is None else arrival
+    taken = len(way[1].costs) - 1 if way else 0
+    at_start = partial(_linearize, problem, z, begin) if taken else lambda: first
+    run = _Run(problem, method, tolerance, control, sufficient, first, arrival, taken, at_start)
+    if may_be_weak:
         is_weak = method.find_weak(run.point.linear_model.decomposition).any(axis=1)
         run.status = np.where(is_weak, DescentStatus.NO_PROGRESS.value, run.status)
     deviations, costs = [z.copy()], [run.point.cost.copy()]
 
-    def observe() -> None:
-        deviations.append(run.point.z.copy())
-        costs.append(run.point.cost.copy())
+    def observe(z: FloatArray, cost: FloatArray) -> None:
+        deviations.append(z.copy())
+        costs.append(cost.copy())
         progress(0, 1, f"fitting, step {len(costs) - 1}: sum of squares {costs[-1][0]:.4g}")
 
-    for i in range(control.iterations + 1):
+    if way:
+        costs = [way[1].costs[:1]]
+        for reached, cost in zip(way[1].deviations[1:], way[1].costs[1:], strict=True):
+            observe(reached[None], cost[None])
+    for i in range(taken, control.iterations + 1):
         if run.accept_chains():
-            observe()
+            observe(run.point.z, run.point.cost)
         active = np.flatnonzero(run.status == DescentStatus.RUNNING.value)
         if not active.size:
             break
@@ -395,7 +410,7 @@ def descend(
         if not active.size or i == control.iterations:
             break
         if run.evaluate(active, current, step, i):
-            observe()
+            observe(run.point.z, run.point.cost)
     running = run.status == DescentStatus.RUNNING.value
     run.status[running] = DescentStatus.OUT_OF_ITERATIONS
     last = run.point
@@ -412,6 +427,25 @@ def descend(
         deviation_history=np.stack(deviations),
         cost_history=np.stack(costs),
     )
+
+
+def _advance(
+    problem: LeastSquaresProblem,
+    z: FloatArray,
+    begin: Start,
+    method: Method,
+    control: StepControl,
+    tolerance: float,
+) -> tuple[Linearization, Advanced] | None:
+    """Return the linearization to which full steps of one trial lead from z (1, p), and the way
+    there, by one call of the engine; None where steps must be taken one by one.
+    """
+    advance = getattr(problem, "advance", None)
+    if advance is None or (fixed := fix_penalty(method, problem.parameters)) is None:
+        return None
+    rules = FURTHER, SLOWEST, ACCEPTED_SHARE, ROUNDING, certain_share(tolerance)
+    limits = Limits(np.inf, control.relative, control.absolute, *rules)
+    return advance(z, begin, Steps(z[0], fixed, min(control.iterations, PATIENCE), limits))
 
 
 @dataclass(frozen=True, eq=False)
@@ -470,6 +504,8 @@ class _Run:
         sufficient: float,
         first: Linearization,
         arrival: FloatArray,
+        taken: int,
+        at_start: Callable[[], Linearization],
     ) -> None:
         self.problem, self.method, self.tolerance = problem, method, tolerance
         self.control, self.sufficient = control, sufficient
@@ -477,9 +513,9 @@ class _Run:
         self.point, t = self.locate(first, arrival), len(first.deviation)
         running, bad = DescentStatus.RUNNING.value, DescentStatus.BAD_START.value
         self.status = np.where(np.isfinite(self.point.cost), running, bad).astype(int)
-        self.taken = np.zeros(t, dtype=np.int64)
-        self.chains = _FullSteps(self.point)
-        self.damping = _Damping(t, control.damping, self.point.linear_model)
+        self.taken = np.full(t, taken)
+        self.chains = _FullSteps(self.point, taken)
+        self.damping = _Damping(t, control.damping, lambda: self.locate(at_start(), arrival))
         self.marks = np.full((t, 3), np.inf)  # of the last progress, and evaluations since then
         self.age = np.zeros(t, dtype=np.int64)
 
@@ -596,20 +632,24 @@ class _Damping:
     """Levenberg-Marquardt damping of t trials by Nielsen's rule: working memory of one iteration.
 
     first : damping of the first step, in units of these squares.
-    model : at the start; its largest squared singular values scale the damping.
+    locate : gives the start; its largest squared singular values scale the damping.
     """
 
-    def __init__(self, trials: int, first: float, model: LinearModel) -> None:
-        self._model = model
+    def __init__(self, trials: int, first: float, locate: Callable[[], _Point]) -> None:
+        self._locate = locate
         self.value: FloatArray = np.zeros(trials)
         if first:
             self.value = first * self._measure_curvature(np.arange(trials))
         self.growth: FloatArray = np.full(trials, 2.0)
         self._floor = np.full(trials, np.nan)
 
+    @cached_property
+    def _start(self) -> _Point:
+        return self._locate()
+
     def _measure_curvature(self, trials: IntArray) -> FloatArray:
         """Return the largest squared singular values (a,) of some trials."""
-        s = self._model.take(trials).decomposition.singular_values
+        s = self._start.linear_model.take(trials).decomposition.singular_values
         return s.max(axis=1, initial=0.0) ** 2
 
     def adapt(self, trials: IntArray, accepted: BoolArray, ratio: FloatArray) -> None:
@@ -639,11 +679,11 @@ class _FullSteps:
     `is_ahead` (t,) are the trials with a chain.
     """
 
-    def __init__(self, point: _Point) -> None:
+    def __init__(self, point: _Point, taken: int) -> None:
         self._point, trials = point, len(point.z)
         self.is_ahead: BoolArray = np.zeros(trials, dtype=bool)
         self._is_low = np.zeros(trials, dtype=bool)
-        self._count, self._taken = np.zeros(trials, dtype=np.int64), np.zeros(trials, dtype=int)
+        self._count, self._taken = np.zeros(trials, dtype=np.int64), np.full(trials, taken)
         self._wait = np.full(trials, FIRST_WAIT)
         self._length, self._promised = np.zeros(trials), np.zeros(trials)
 
@@ -759,6 +799,11 @@ def _find_ending(
     converged = good & (step.full_length <= SMALL_STEP * spread)
     ending = np.where(converged, DescentStatus.CONVERGED.value, DescentStatus.NO_DESCENT.value)
     return np.where(is_stuck, ending, DescentStatus.RUNNING.value)
+
+
+def _linearize(problem: LeastSquaresProblem, z: FloatArray, start: Start) -> Linearization:
+    """Linearize where a descent begins."""
+    return replace(_clear_failed(problem.linearize(z, start)), deviation=z)
 
 
 def _clear_failed(linearized: Linearization) -> Linearization:

@@ -53,9 +53,8 @@ from loopcal.estimate.observation_rows import ObservationRows, consecutive_pairs
 from loopcal.estimate.pose_coordinates import PoseCoordinates
 from loopcal.findings import report_finding
 from loopcal.mechanism.actuation import drive_joints
-from loopcal.mechanism.kinematics import find_wrong_rows, is_square
+from loopcal.mechanism.kinematics import WIDE, is_square
 from loopcal.mechanism.sensitivity import fold_pose_rows
-from loopcal.mechanism.states import Status
 from loopcal.numerics.decomposition import NULL_COMPONENT, empty_factor
 from loopcal.numerics.elimination import (
     Elimination,
@@ -311,26 +310,29 @@ class PoseRows:
         return factor, is_lost
 
     def fold_compared(
-        self, factor: FloatArray, z: FloatArray, begin: PoseStates
-    ) -> tuple[FloatArray, PoseStates] | None:
-        """Solve the poses of one trial and fold their rows by one call of the engine; return also
-        the states. None where the engine does not, or where a pose is not solved.
+        self, z: FloatArray, begin: PoseStates, steps: engine.Steps
+    ) -> tuple[engine.Advanced, PoseStates] | None:
+        """Solve the poses of one trial, fold their rows, and take full steps from z (1, p), by one
+        call of the engine; return also the states. None where the engine does not, or where a pose
+        is not solved.
         """
         if self.compared is None:
             return None
-        robot, q = self.free.robot, self.coordinates.readings
-        values = self.free.values(z)
-        e, tau, joints = drive_joints(robot, values, q)
-        inputs = self.free.columns.linearize(values, tau, q)
-        at = robot.program, e, joints, begin.state, inputs
-        done = engine.fold_compared(factor, *at, self.compared)
-        if done is None:
+        robot, q, columns = self.free.robot, self.coordinates.readings, self.free.columns
+
+        def move(z: FloatArray) -> tuple[FloatArray, FloatArray, engine.ParameterMap]:
+            values = self.free.values(z[None])
+            e, tau, joints = drive_joints(robot, values, q)
+            return e, joints, columns.linearize(values, tau, q)
+
+        limits = steps.limits._replace(widest=WIDE * robot.size)
+        own = steps._replace(limits=limits, move=None if columns.is_constant else move)
+        (e, joints, inputs), factor = move(z[0]), empty_factor(1, z.shape[1])
+        at = robot.program, e, joints, begin.state, inputs, self.compared, own
+        done = engine.fold_compared(factor, *at)
+        if done is None or not len(done.deviations):
             return None
-        state, factor, is_finite = done
-        is_solved = (state.status == Status.CONVERGED.value).all() and is_finite.all()
-        if not is_solved or find_wrong_rows(robot, state, begin.state.closure_sign).any():
-            return None
-        return factor, PoseStates(state, begin.q)
+        return done, PoseStates(done.state, begin.q)
 
     def linearize_kinds(
         self,

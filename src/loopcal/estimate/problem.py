@@ -128,6 +128,10 @@ def _without_noise(rows: ObservationRows) -> ObservationRows:
     return replace(rows, measured=cleared)
 
 
+NO_STEPS = engine.Steps(np.zeros(0), np.zeros((0, 0)), 0, engine.Limits(*[0.0] * 8))
+"""Rows where a trial stands."""
+
+
 class ConsistentPoses(NamedTuple):
     """Finds poses, near given ones, at which rows have no residual.
 
@@ -318,13 +322,10 @@ class Problem:
         Nuisance parameters and uncertain poses are those that fit best there; the iteration to them
         begins at `start`.
         """
+        advanced = self.advance(deviation, start, NO_STEPS)
+        if advanced is not None:
+            return advanced[0]
         t, known, poses, folds = len(self), None, self.poses, self.folds_plain_rows
-        if folds and t == 1 and start.poses is not None:
-            done = poses.fold_compared(empty_factor(1, self.parameters), deviation, start.poses)
-            if done is not None:
-                near = replace(start, deviation=deviation, poses=done[1], is_near=True)
-                cost = (done[0][:, :, -1] ** 2).sum(axis=1)
-                return Linearization(deviation, done[0], cost, self.residual_count, near)
         are_shared = poses.is_kept and poses.coordinates.are_shared
         if are_shared and t > 1 and (deviation == deviation[0]).all():
             known = poses.solve_exact_poses(deviation[:1], start, not folds)
@@ -337,6 +338,22 @@ class Problem:
             )
             linearizations.append(self.take(chosen).linearize_at(z, begin, solution))
         return Linearization.join(linearizations)
+
+    def advance(
+        self, deviation: FloatArray, start: Start, steps: engine.Steps
+    ) -> tuple[Linearization, engine.Advanced] | None:
+        """Take full steps of one trial from a deviation (1, p) and linearize where they end, by one
+        call of the engine; None where that is not possible.
+        """
+        if start.poses is None or len(self) != 1 or not self.folds_plain_rows:
+            return None
+        own = steps._replace(deviation=deviation[0])
+        if (done := self.poses.fold_compared(deviation, start.poses, own)) is None:
+            return None
+        way, states = done
+        z, cost = way.deviations[-1:], (way.factor[:, :, -1] ** 2).sum(axis=1)
+        near = replace(start, deviation=z, poses=states, is_near=True)
+        return Linearization(z, way.factor, cost, self.residual_count, near), way
 
     def linearize_at(
         self, deviation: FloatArray, start: Start, solution: PoseSolution

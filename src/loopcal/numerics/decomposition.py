@@ -462,6 +462,11 @@ def solve_triangles(triangle: FloatArray, right: FloatArray) -> FloatArray:
     return x
 
 
+def certain_share(tolerance: float) -> float:
+    """Return the share of |R| above which `solve_regular` needs all singular values of R."""
+    return MARGIN * max(tolerance, ROUNDING)
+
+
 def solve_regular(
     triangle: FloatArray, right: FloatArray, tolerance: float
 ) -> tuple[FloatArray, BoolArray]:
@@ -485,7 +490,7 @@ def solve_regular(
             x[usable], is_regular[usable] = solved
         return x, is_regular
     x, growth = engine.solve_triangles(triangle, right) or _solve_both(triangle, right, diagonal)
-    needed = MARGIN * max(tolerance, ROUNDING) * norm
+    needed = certain_share(tolerance) * norm
     is_regular = needed * np.sqrt(p) * growth < 1.0
     doubtful = np.flatnonzero(~is_regular)
     if doubtful.size:

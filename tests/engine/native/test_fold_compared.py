@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One call gives what solving, comparing and folding give one after the other."""
+"""One call gives what solving, comparing, folding and full steps give one after the other."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 import loopcal as lc
 from benchmarks.peers.__main__ import make_cases
 from loopcal import engine as api
-from loopcal.engine import ComparedPoses, TwistRows
+from loopcal.engine import ComparedPoses, Limits, Steps, TwistRows
 from loopcal.estimate import pose_rows
 from loopcal.numerics.trial_batch import map_arrays
 from tests.engine.cases import draw_map
@@ -34,6 +34,24 @@ def make_arguments(name: str, n: int):
     return case.program, case.e, case.q, start, draw_map(case.program, (1, n), False)
 
 
+def stay(p: int) -> Steps:
+    """Return no step from a deviation of p parameters; any residual of closure is accepted."""
+    return Steps(np.zeros(p), np.zeros((0, p)), 0, Limits(np.inf, *[0.0] * 7))
+
+
+def record_steps(case, engine, monkeypatch) -> list:
+    """Return the arguments and the result of each call of an engine in a fit of a peers' case."""
+    calls = []
+
+    def fold_compared(*arguments):
+        calls.append((arguments, engine.fold_compared(*arguments)))
+        return calls[-1][1]
+
+    monkeypatch.setattr(pose_rows.engine, "fold_compared", fold_compared)
+    lc.identify(case.robot, case.data, lc.LeastSquares())
+    return calls
+
+
 @pytest.mark.parametrize("engine", ENGINES, ids=str)
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("height", HEIGHTS)
@@ -42,7 +60,8 @@ def test_one_call_gives_what_three_give(engine, name, height):
     program, e, q, start, inputs = arguments
     measured, p = draw_measured(n, height), inputs.pattern.parameters
     factor = np.triu(np.random.default_rng(1).normal(size=(1, p + 1, p + 1)))
-    state, folded, is_finite = engine.fold_compared(factor, *arguments, measured)
+    done = engine.fold_compared(factor, *arguments, measured, stay(p))
+    state, folded, is_finite = done[:3]
     alone = engine.solve(program, e, q, start)
     for ours, theirs in zip(list_arrays(state).values(), list_arrays(alone).values(), strict=True):
         assert_array_equal(ours, theirs)
@@ -65,8 +84,8 @@ def test_all_instruction_sets_give_the_same_bits(name):
     factor = np.zeros((1, p + 1, p + 1))
     calls = [e.fold_compared for e in ENGINES if e.fold_compared is not None]
     assert len(calls) == len(ENGINES)
-    results = [fold(factor, *arguments, measured) for fold in calls]
-    first, *others = ([*list_arrays(r[0]).values(), *r[1:]] for r in results)
+    results = [fold(factor, *arguments, measured, stay(p)) for fold in calls]
+    first, *others = ([*list_arrays(r[0]).values(), *r[1:3]] for r in results)
     for other in others:
         for ours, theirs in zip(first, other, strict=True):
             assert_array_equal(ours, theirs)
@@ -87,9 +106,12 @@ def test_measured_poses_of_wrong_shapes_are_refused(engine):
     ]
     for one in wrong:
         with pytest.raises(ValueError, match="poses"):
-            engine.fold_compared(factor, *arguments, one)
+            engine.fold_compared(factor, *arguments, one, stay(p))
     with pytest.raises(ValueError, match="factor"):
-        engine.fold_compared(factor[:, :-1], *arguments, measured)
+        engine.fold_compared(factor[:, :-1], *arguments, measured, stay(p))
+    for steps in (stay(p - 1), stay(p)._replace(penalty=np.eye(p + 1))):
+        with pytest.raises(ValueError, match="penalty"):
+            engine.fold_compared(factor, *arguments, measured, steps)
 
 
 def test_a_measured_pose_gives_a_residual_of_zero_at_itself():
@@ -102,8 +124,58 @@ def test_a_measured_pose_gives_a_residual_of_zero_at_itself():
         measured = ComparedPoses(np.arange(9), reference, whitener)
         zeros = np.zeros((1, p + 1, p + 1))
         assert engine.fold_compared is not None
-        _, factor, _ = engine.fold_compared(zeros, program, e, q, start, inputs, measured)
+        given = program, e, q, start, inputs, measured, stay(p)
+        factor = engine.fold_compared(zeros, *given).factor
         assert_allclose(factor[0, :, p], 0.0, atol=1e-14)  # [rad, m]: rounding of poses
+
+
+@pytest.mark.parametrize("key", ["hexapod", "delta"])
+def test_steps_have_the_same_bits_for_every_instruction_set(key, monkeypatch):
+    case = make_cases()[key]
+    (first, *_), *others = (record_steps(case, engine, monkeypatch) for engine in ENGINES)
+    assert len(first[1].costs) > 2  # a hexapod takes two steps and a delta three
+    assert (first[0][-1].move is None) == (key == "hexapod")  # its map is the same everywhere
+    for other, *_ in others:
+        for ours, theirs in zip(first[1][1:], other[1][1:], strict=True):
+            assert_array_equal(ours, theirs)
+        for name, array in list_arrays(first[1].state).items():
+            assert_array_equal(array, list_arrays(other[1].state)[name])
+
+
+FROM = (("hexapod", 0.1, 3), ("hexapod", 600.0, 5), ("delta", 0.1, 3), ("delta", 70.0, 4))
+"""Starts, in tolerances and with the seed of their direction. From the far ones the engine refuses
+a step behind the first, and the descent goes on with damping."""
+
+
+@pytest.mark.parametrize(("key", "far", "seed"), FROM)
+@pytest.mark.parametrize("method", [lc.LeastSquares(), lc.MAP(), lc.Ridge(2.0)], ids=repr)
+def test_steps_of_the_engine_are_those_of_the_descent(key, far, seed, method, monkeypatch):
+    case = make_cases()[key]
+    free = case.robot.parameters.free
+    start = case.robot.values.copy()
+    start[free] += far * np.random.default_rng(seed).normal(size=free.sum()) * case.unit
+    options = lc.FitOptions(start=start)
+    fit = lc.identify(case.robot, case.data, method, options=options)
+    monkeypatch.setattr(pose_rows.engine, "fold_compared", lambda *_: None)
+    other = lc.identify(case.robot, case.data, method, options=options)
+    assert fit.history.iterations == other.history.iterations
+    assert fit.history.status == other.history.status
+    assert_allclose(fit.history.cost, other.history.cost, rtol=1e-6)
+    # 1e-9 standard deviations: rounding of rows at 1e-16 of the size of the robot
+    sd = fit.standard_deviations.min()
+    assert_allclose(fit.estimate, other.estimate, rtol=0, atol=1e-9 * sd)
+
+
+def test_an_error_of_the_map_passes_through_the_engine(monkeypatch):
+    case = make_cases()["delta"]
+    (arguments, _), *_ = record_steps(case, ENGINES[0], monkeypatch)
+
+    def fail(_):
+        raise KeyError("no map")
+
+    steps = arguments[-1]._replace(move=fail)
+    with pytest.raises(KeyError, match="no map"):
+        ENGINES[0].fold_compared(*arguments[:-1], steps)
 
 
 @pytest.mark.parametrize("key", ["hexapod", "delta"])
