@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.stats import chi2
+from scipy.stats import chi2, t
 
 from loopcal import geometry, load_robot
 from loopcal.apply.accuracy import accuracy_map, pose_uncertainty, simulate_accuracy
@@ -105,6 +105,8 @@ def test_size_of_pose_uncertainty_does_not_depend_on_the_axes(fit):
     np.testing.assert_allclose(base.orientation, platform.orientation, rtol=1e-9)
     assert "platform axes" in platform.frame
     assert np.array_equal(base.expanded, base.coverage_factor * base.sd)
+    student = t(base.degrees.components)  # one coverage for all: 95 %
+    np.testing.assert_allclose(student.cdf(base.coverage_factor), 0.975, rtol=1e-12)
     np.testing.assert_allclose(base.degrees.position, platform.degrees.position, rtol=1e-9)
 
 

@@ -20,10 +20,15 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+SPREADS = "expected spreads  "  # begins a row
+
+
 def test_page_has_one_line_for_each_source_and_fits_a_screen(loopcal, run):
-    said = ("Expected error", "instrument: pose", "tolerances", "all sources", "halved:")
+    said = ("Expected error", "instrument: pose", "expected spreads", "all sources", "halved:")
     lines = loopcal(f"budget {run}", *said, "[um]", "[urad]").out.splitlines()
     assert len(lines) < 64
+    cells = [line.split() for line in lines if line.startswith("factor on the expected spreads ")]
+    assert cells[0][6] == cells[1][-1] == "infinite"  # degrees of freedom in both tables
     assert max(map(len, lines)) <= 132
 
 
@@ -33,7 +38,7 @@ def test_a_platform_that_does_not_rotate_has_no_column_of_orientations(loopcal):
     loopcal("calibrate linear-delta data.csv -o run")
     page = loopcal("budget run").out
     assert "orientation" not in page
-    rows = [line.split() for line in page.splitlines() if line.startswith(("tolerances", "all "))]
+    rows = [line.split() for line in page.splitlines() if line.startswith((SPREADS, "all "))]
     assert page.count("JCGM 100") == 1
     assert all(float(cell) > 0.0 for cell in rows[0][-4:])
     assert rows[1][-2:] == ["-", "-"]

@@ -82,19 +82,19 @@ CONTENTS = [
     ("verdict", r"Expected error over the workspace: position"),
     ("verdict", r"Share of each source in the variance"),
     (
-        "verdict",
-        r"against the limit 0.06 mm: conforms\. .*is (?:more than )?[\d.]+ %",
+        "summary",
+        r"against the limit 60 um: conforms\. .*is (?:more than )?[\d.]+ %",
     ),  # guard-banded
     (
         "budget",
         r"\(box x -20 mm to 20 mm, y 250 mm\), the position error is at most .*, simultaneously",
     ),
-    ("verdict", r"in the volume: .* against the limit 0.06 mm"),
+    ("summary", r"in the volume: .* against the limit 60 um"),
     ("determined", r"The data determine all \d+ parameters"),
     ("outliers", r"No outliers among .*Excluded from the fit by its options: 4\."),
     ("errors", r"Before: .*frames.*After: .*Noise floor: "),
     ("errors", r"rms +\d+ +[\d.]+ +[\d.]+ +[\d.]+"),
-    ("residuals", r"Chi-square is [\d.]+ with"),
+    ("residuals", r"Chi-square is [\d.]+ with .* for a sigma with an uncertainty of 25 %"),
     ("residuals", r"histogram"),
     ("residuals", r"normal"),
     ("residuals", r"time \["),
@@ -171,7 +171,7 @@ def test_a_note_is_in_one_section_only(document, report) -> None:
 
 def test_provenance_words_options_and_method_without_python(document) -> None:
     text = write_text(get_section(document, "provenance"))
-    assert re.search(r"option: limit position +6e-05 m", text)
+    assert re.search(r"option: limit position +0.06 mm", text)
     assert re.search(r"option: held out +7, 11, 15, 19, 23", text)
     assert re.search(r"option: check conventions +yes", text)
     assert re.search(r"method +MAP$", text, re.MULTILINE)
@@ -181,10 +181,12 @@ def test_provenance_words_options_and_method_without_python(document) -> None:
 def test_stored_options_are_worded() -> None:
     fit = lc.FitOptions(noise="estimated", loss=lc.Huber(2.0)).to_dict()
     options = {"fit": fit, "seed": 3, "prior": {"object": "<Posterior of x: 3 parameters>"}}
+    options["limit_position"] = 0.015 * 1e-3  # 1.4999999999999999e-05
     assert list_options(options | {"choose_model": True, "compare_with": None}) == [
-        ("option: loss", "huber (k 2.0)"),
+        ("option: loss", "huber (k 2)"),
         ("option: noise", "estimated"),
         ("option: seed", "3"),
         ("option: prior", "Posterior"),
+        ("option: limit position", "0.015 mm"),
         ("option: choose model", "yes"),
     ]

@@ -15,6 +15,7 @@ import pytest
 import loopcal as lc
 from loopcal.cli.entry_point import main
 from loopcal.errors import DataError, FileError
+from loopcal.io.runs import certificate
 from loopcal.io.runs.certificate import format_certificate, load_administration, read_template
 from loopcal.io.runs.run_folder import load_run_or_robot
 from tests.io.test_instruments import FACTS, data, robot, with_instrument  # noqa: F401
@@ -213,11 +214,12 @@ def test_certificate_follows_the_schema_and_states_the_run(tmp_path, run) -> Non
     assert "do not cover influences outside" in verdict
     warnings = [f["text"] for f in content["findings"] if f["severity"] == "warning"]
     assert all(text in verdict for text in warnings)
-    judged = content["validation"]["conformity"]["position"]
-    assert f"guard band {1e3 * judged['guard_band']:.3g} mm" in limit
+    (judged,) = [f for f in content["findings"] if not f["data"].get("is_volume", True)]
+    assert limit.startswith(judged["text"])
+    assert content["fit"]["interval_note"] in verdict
     stated = content["volume"]
     assert volume == stated["findings"][0]["text"]
-    assert f"guard band {1e3 * stated['conformity']['guard_band']:.3g} mm" in limit_of_volume
+    assert limit_of_volume in [f["text"] for f in stated["findings"]]
     bounds = {read_text(q, "dcc:name/dcc:content"): q for q in quantities}
     for name in ("simultaneous", "pointwise"):
         (bound,) = (q for words, q in bounds.items() if f", {name}" in words)
@@ -330,3 +332,14 @@ def test_commands_print_facts_and_certificate(tmp_path, run, capsys) -> None:
     assert main(["certificate", str(run)]) == 1
     assert main(["new", "five-bar"]) == 1
     assert "FAMILY and -o" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("degrees", "factor"), [(np.inf, 2.45), (10.0, 2.86)])
+def test_region_of_parameters_counts_the_degrees_of_freedom(degrees, factor) -> None:
+    """JCGM 102, 6.5: sqrt(2 F) of 2 and 10 degrees of freedom, and sqrt(chi-square) of known noise."""
+    parameters = [
+        {"name": name, "si:real": {"si:value": "1", "si:unit": r"\metre"}} for name in "ab"
+    ]
+    (region,) = certificate._describe_covariance(np.eye(2), parameters, degrees)
+    stated = region["si:realListXMLList"]["si:measurementUncertaintyMultivariateXMLList"]
+    assert stated["si:ellipsoidalRegionMUXMLList"]["si:coverageFactorXMLList"] == str(factor)

@@ -44,7 +44,7 @@ from loopcal.estimate.identification import (
 )
 from loopcal.estimate.penalties import LeastSquares, Method
 from loopcal.estimate.posterior import NOISE, Posterior, combine_degrees
-from loopcal.estimate.residual_test import coverage_factor
+from loopcal.estimate.residual_test import LEVEL, coverage_factor
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding
 from loopcal.findings.wording import round_to_digits
@@ -62,10 +62,6 @@ from loopcal.results.description import Field, fields, label_axes, within
 from loopcal.results.result import DrawnResult, TableResult
 from loopcal.typing import BoolArray, FloatArray, Progress, report_no_progress
 
-# Coverage of the expanded uncertainty of a component: that of k = 2 for normal errors (JCGM 100,
-# table G.2).
-COMPONENT_LEVEL = 0.954499736103642
-LEVEL = 0.95  # share of the errors below the expanded uncertainty of a length or an angle
 BLOCK = 1024  # poses whose sensitivities are in memory at once
 BATCH = 250  # trials that are identified at once; progress is reported between them
 
@@ -136,14 +132,12 @@ class PoseUncertainty(TableResult):
 
     @property
     def coverage_factor(self) -> FloatArray:
-        """(n, 6) factor k of each component for a coverage of 95.45 %: 2 where the noise is known,
-        else that of Student's t.
-        """
-        return coverage_factor(self.degrees.components, COMPONENT_LEVEL)
+        """(n, 6) factor k of each component for a coverage of 95 %, of Student's t."""
+        return coverage_factor(self.degrees.components)
 
     @property
     def expanded(self) -> FloatArray:
-        """(n, 6) expanded uncertainty U = k sd of each component, about 95 % [rad, m]."""
+        """(n, 6) expanded uncertainty U = k sd of each component, 95 % [rad, m]."""
         return self.coverage_factor * self.sd
 
     @property

@@ -45,8 +45,9 @@ from loopcal.numerics.statistics import (
 )
 from loopcal.results.description import Field, fields
 from loopcal.results.result import Result
+from loopcal.results.tables import choose_unit
 from loopcal.typing import FloatArray
-from loopcal.units import Unit
+from loopcal.units import Dimension, Unit
 
 LEVEL = 0.95  # probability that conformity and nonconformity need: the default of ISO 14253-1:2017
 # Probabilities of the bounds of an interval, and of the estimate between them.
@@ -316,27 +317,32 @@ def report_conformity(
         stated: dict[str, Any] = {
             "pose": poses[errors.rows[worst]],
             "target": errors.targets[worst],
-            "error": _show(measured, unit),
+            "error": measured,
         }
         if result is not None:
             findings.append(report_decision(quantity, result, unit, **stated))
             continue
         code = "gates.limit-exceeded" if measured > limit else "gates.limit-kept"
-        findings.append(report_finding(code, quantity=quantity, limit=_show(limit, unit), **stated))
+        stated |= {"limit": _show(limit, unit), "error": _show(measured, unit)}
+        findings.append(report_finding(code, quantity=quantity, **stated))
     return findings
 
 
 def report_decision(quantity: str, result: Conformity, unit: Unit, **measured: Any) -> Finding:
-    """Return the decision on a limit in words.
+    """Return the decision on a limit in words, its lengths in one unit.
 
     measured : pose, target and size of the largest measured error; without any, the error is that
         of a volume.
     """
+    if unit.dimension is Dimension.LENGTH:
+        unit = choose_unit(unit, [0.1 * min(result.limit, result.expanded or result.limit)])
+    stated = {"pose": "", "target": "", "error": None, **measured}
+    stated |= {"error": _show(measured["error"], unit)} if measured else {}
     return report_finding(
         f"conformity.{result.decision.name.lower()}",
         quantity=quantity,
         is_volume=not measured,
-        **{"pose": "", "target": "", "error": None, **measured},
+        **stated,
         **{name: _show(getattr(result, name), unit) for name in STATED},
         **{name: getattr(result, name) for name in STATED_NUMBERS},
     )

@@ -73,7 +73,7 @@ SOURCE_WORDS = {
     READINGS: "actuator readings",
     SETUP: "setup parameters",
     COMMON: "common error: {name}",
-    TOLERANCES: "tolerances",
+    TOLERANCES: "expected spreads",
     EARLIER: "earlier calibration",
     REPEATABILITY: "repeatability in use",
     DISCREPANCY: "model discrepancy: {name}",

@@ -22,7 +22,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from loopcal.apply.accuracy import BLOCK, LEVEL, PoseUncertainty, pose_uncertainty
+from loopcal.apply.accuracy import BLOCK, PoseUncertainty, pose_uncertainty
 from loopcal.apply.conformity import Conformity, judge_draws, report_decision
 from loopcal.checks import check_choice
 from loopcal.diagnose.error_frames import (
@@ -34,6 +34,7 @@ from loopcal.diagnose.error_frames import (
 )
 from loopcal.errors import DataError, EstimationError, UnitError
 from loopcal.estimate.posterior import Posterior
+from loopcal.estimate.residual_test import LEVEL
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, Severity, report_finding
 from loopcal.findings.catalog import word_phrase

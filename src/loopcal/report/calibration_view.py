@@ -338,14 +338,13 @@ def build_budget_table(budget: Mapping[str, Any], robot: Mechanism) -> Table:
         shown[worst] = choose_unit(unit, [total[worst]])
 
     def list_cells(
-        words: str, evaluation: str, degrees: float | None, *errors: Mapping[str, float | None]
+        words: str, evaluation: str, freedom: str, *errors: Mapping[str, float | None]
     ) -> list[str]:
         numbers = [
             ABSENT if (value := of.get(kind)) is None else format_in(unit, value, 3)
             for of in errors
             for kind, unit in shown.items()
         ]
-        freedom = ABSENT if degrees is None else format_number(degrees, 3)
         return [words, evaluation, freedom, *numbers]
 
     rows = []
@@ -356,9 +355,9 @@ def build_budget_table(budget: Mapping[str, Any], robot: Mechanism) -> Table:
             left[worst] = halved["worst_parameter_sd"]
         squares = {**{kind: line[kind] for kind in LENGTHS}, **line["parameters"]}
         errors = {k: None if square is None else math.sqrt(square) for k, square in squares.items()}
-        fixed = (_name_source(line), line["evaluation"], line["degrees"])
+        fixed = _name_source(line), line["evaluation"], _format_degrees(line["degrees"] or math.inf)
         rows.append(list_cells(*fixed, errors, left))
-    rows.append(list_cells("all sources", "", None, total, {}))
+    rows.append(list_cells("all sources", "", "", total, {}))
     columns = [
         Column(f"{before}{kind}", unit.symbol)
         for before in ("", "halved: ")

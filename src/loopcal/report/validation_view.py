@@ -158,7 +158,8 @@ def view_error_statistics(validation: Validation, with_before: bool = True) -> l
     for name, error in errors.items():
         for quantity in validation.quantities:
             statistics = error.statistics(quantity)
-            unit = choose_unit(validation.units[quantity], [statistics[key] for key in METRICS])
+            after = validation.after.statistics(quantity)
+            unit = choose_unit(validation.units[quantity], [after[key] for key in METRICS])
             cells = (format_in(unit, statistics[key], 3) for key in METRICS)
             rows.append((name, quantity, str(statistics.count), *cells, unit.symbol))
     numbers = map(Column, ("count", *(metric.words for metric in METRICS.values())))

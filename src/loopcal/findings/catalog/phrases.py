@@ -111,11 +111,11 @@ def best_or_near(data: Data) -> str:
 SOURCES = {
     "instrument": "instrument",
     "readings": "actuator readings",
-    "setup": "set-up",
-    "common": "common errors of the instrument",
-    "tolerances": "undetermined parameters",
+    "setup": "setup parameters",
+    "common": "common errors",
+    "tolerances": "expected spreads",
     "earlier": "earlier calibration",
-    "repeatability": "repeatability",
+    "repeatability": "repeatability in use",
     "discrepancy": "model discrepancy",
     "other": "other errors that the residuals show",
 }

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A digital calibration certificate of a run: the XML of PTB's schema, DCC 3.3.0, with D-SI values.
 
-Every value is in SI, with its expanded uncertainty (coverage probability 95 %); sentences for
-people are in mm and deg. The certificate states what the run states: parameters, errors at held-out
+Every value is in SI, with its expanded uncertainty (coverage probability 95 %). The certificate states what the run states: parameters, errors at held-out
 poses and in a volume, conformity with limits, and the instruments. Elements and their order:
 https://ptb.de/dcc/v3.3.0/; the values: https://ptb.de/si/v2.2.1/.
 """
@@ -21,12 +20,11 @@ from xml.etree.ElementTree import Element, indent, register_namespace, tostring
 import numpy as np
 
 from loopcal.errors import DataError
-from loopcal.findings.catalog.phrases import conformity_probability
 from loopcal.io.core.records import read_record
 from loopcal.io.core.yaml_file import Location, name_location, read_yaml
 from loopcal.io.runs.run_folder import refuse_changed_run
 from loopcal.measure.observations import is_date
-from loopcal.numerics.statistics import compute_chi_square_quantile
+from loopcal.numerics.statistics import compute_f_quantile
 from loopcal.plain_text import escape
 from loopcal.results.tables import format_number, format_uncertainty, format_with_uncertainty
 from loopcal.units import NUMBER, Dimension, find_unit
@@ -201,8 +199,8 @@ VERSION = "3.3.0"
 PROBABILITY = 0.95  # coverage probability of the stated intervals
 SCOPE = (
     "The results concern the geometry in the region and under the conditions of the measured "
-    "poses. They rest on the expected spreads as a prior, and do not cover influences outside the "
-    "measurement, such as other loads, temperatures or speeds."
+    "poses. They do not cover influences outside the measurement, such as other loads, "
+    "temperatures or speeds."
 )
 # What the results and the statements on limits are about.
 PREDICTED = (
@@ -217,11 +215,11 @@ VOLUME_BOUNDS = {
 
 # Dimension -> unit in the D-SI; ratios have the unit one.
 UNITS = {Dimension.LENGTH: r"\metre", Dimension.ANGLE: r"\radian"}
-# Decision on a limit -> word of the schema.
+# Code of a decision on a limit -> word of the schema.
 CONFORMITY = {
-    "conforms": "pass",
-    "does not conform": "fail",
-    "neither conforms nor fails": "noPass",
+    "conformity.conforms": "pass",
+    "conformity.fails": "fail",
+    "conformity.undecided": "noPass",
 }
 
 # Characters that no XML document may hold.
@@ -383,7 +381,8 @@ def _list_results(run: Run) -> Iterator[Content]:
         values = (row["estimate"], row["plus_minus"], row["sd"])
         scaled = (None if x is None else x * unit.factor_to_si for x in values)
         parameters.append(_quantity(row["name"], UNITS.get(unit.dimension, r"\one"), *scaled))
-    covariance = _describe_covariance(run.arrays.get("covariance"), parameters)
+    degrees = min((row["degrees"] or math.inf for row in content["fit"]["parameters"]), default=0.0)
+    covariance = _describe_covariance(run.arrays.get("covariance"), parameters, degrees)
     yield {"name": "Identified parameters", "data": {"quantity": [*parameters, *covariance]}}
     if volume := content.get("volume"):
         bound = "upper bound of the position error with a coverage probability of 95 %"
@@ -428,7 +427,7 @@ def _list_budgets(budget: Mapping[str, Any]) -> Iterator[Content]:
 
 
 def _describe_covariance(
-    covariance: np.ndarray | None, parameters: Sequence[Content]
+    covariance: np.ndarray | None, parameters: Sequence[Content], degrees: float
 ) -> list[Content]:
     """Return the parameters of finite variance as one list with their covariance (p, p) [SI].
 
@@ -454,10 +453,11 @@ def _describe_covariance(
         }
         for j, k in enumerate(kept)
     ]
-    factor = float(compute_chi_square_quantile(len(kept), 1.0 - PROBABILITY)) ** 0.5
+    # JCGM 102, 6.5, with the fewest degrees of freedom of a parameter
+    square = len(kept) * float(compute_f_quantile(len(kept), degrees, 1.0 - PROBABILITY))
     region = {
         "si:covarianceMatrixXMLList": {"si:columnXMLList": columns},
-        "si:coverageFactorXMLList": f"{factor:.3g}",
+        "si:coverageFactorXMLList": f"{square**0.5:.3g}",
         "si:coverageProbabilityXMLList": repr(PROBABILITY),
     }
     values = {
@@ -504,37 +504,18 @@ def _list_statements(content: Mapping[str, Any]) -> Iterator[Content]:
     if expected and content.get("states_expected_error"):
         stated.append(expected)
     sentences = [content["headline"], *(f["text"] for f in stated), SCOPE]
+    sentences += filter(None, [content["fit"].get("interval_note")])  # whether U rests on a prior
     yield {"name": "Verdict, warnings and expected error", "declaration": " ".join(sentences)}
-    judged = (content.get("validation") or {}).get("conformity") or {}
-    decisions = [
-        (quantity, "at held-out poses", one, PREDICTED) for quantity, one in judged.items()
-    ]
-    if volume := content.get("volume"):
-        told = [f["text"] for f in volume["findings"] if not f["code"].startswith("conformity.")]
+    volume = content.get("volume") or {"findings": ()}
+    if told := [f["text"] for f in volume["findings"] if not f["code"].startswith("conformity.")]:
         yield {"name": "Position error in the working volume", "declaration": " ".join(told)}
-        if volume.get("conformity"):
-            decisions.append(("position", "in the working volume", volume["conformity"], ""))
-    for quantity, where, stated, meaning in decisions:
-        unit, scale = ("mm", 1e3) if quantity == "position" else ("deg", math.degrees(1.0))
-        numbers = {
-            "estimate": "Estimate",
-            "expanded": "expanded uncertainty",
-            "limit": "limit",
-            "guard_band": "guard band",
-            "acceptance_limit": "acceptance limit",
-            "rejection_limit": "rejection limit",
-        }
-        lengths = (
-            f"{words} {stated[k] * scale:.3g} {unit}" for k, words in numbers.items() if k in stated
-        )
-        probability = conformity_probability({"most_probable": stated["probability"], **stated})
-        declaration = (
-            f"{', '.join(lengths)}, probability of conformity {probability}. Decisions need a "
-            f"probability of {100 * stated['level']:.3g} %. {meaning}"
-        )
+    at_poses = (content.get("validation") or {}).get("findings", ())
+    for finding in (f for f in (*at_poses, *volume["findings"]) if f["code"] in CONFORMITY):
+        is_volume = finding["data"]["is_volume"]
+        where = "in the working volume" if is_volume else "at held-out poses"
         yield {
-            "name": f"Conformity of the largest {quantity} error {where}",
+            "name": f"Conformity of the largest {finding['data']['quantity']} error {where}",
             "norm": "ISO 14253-1:2017",
-            "declaration": declaration,
-            "conformity": CONFORMITY[stated["decision"]],
+            "declaration": finding["text"] if is_volume else f"{finding['text']} {PREDICTED}",
+            "conformity": CONFORMITY[finding["code"]],
         }

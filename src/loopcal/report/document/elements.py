@@ -22,6 +22,7 @@ from loopcal.apply.validation import Validation
 from loopcal.estimate.options import OBJECT, FitOptions
 from loopcal.estimate.posterior import Posterior
 from loopcal.estimate.result import KindResiduals
+from loopcal.findings import Quantity
 from loopcal.mechanism.model import Mechanism
 from loopcal.plain_text import escape
 from loopcal.report.scene.scene import load_script
@@ -257,6 +258,7 @@ class CalibrationRecord:
 EMPTY: tuple[Any, ...] = (None, [], {})  # values of options that state nothing
 # Units of options that are numbers [SI].
 UNITS = {"limit_position": "m", "limit_angle": "rad", "volume": "[m, rad]"}
+DIGITS = 12  # of a number, so that 15 um is not 1.4999999999999999e-05 m
 
 
 def list_options(options: Mapping[str, Any]) -> list[tuple[str, str]]:
@@ -267,7 +269,9 @@ def list_options(options: Mapping[str, Any]) -> list[tuple[str, str]]:
     return [
         (
             f"option: {key.replace('_', ' ')}",
-            f"{describe_value(value)} {UNITS.get(key, '')}".strip(),
+            str(Quantity(value, UNITS[key]))
+            if isinstance(value, float) and key in UNITS
+            else f"{describe_value(value)} {UNITS.get(key, '')}".strip(),
         )
         for key, value in stated.items()
         if value not in EMPTY
@@ -283,7 +287,7 @@ def describe_value(value: Any) -> str:
             return f"{len(value)} rows"
         return ", ".join(map(describe_value, value))
     if not isinstance(value, dict):
-        return str(value)
+        return f"{value:.{DIGITS}g}" if isinstance(value, float) else str(value)
     if OBJECT in value:  # `<Posterior of ...>` of Python
         return str(value[OBJECT]).strip("<>").split(" ")[0]
     settings = ", ".join(

@@ -142,6 +142,7 @@ def describe_summary(record: CalibrationRecord) -> Iterator[Element]:
     columns = ("error", *map(Column, ("before", "after", "limit")), "decision")
     result = make_table("Result", columns, _list_results(record))
     yield result if result.rows else say("summary.no-result")
+    yield from select_findings(record, (CONFORMITY,))  # with their uncertainty (ISO/IEC 17025)
     judged = [each for each in (volume, record.result.get("validation") or {}) if each]
     decided = [c for each in judged if (c := each.get("conformity"))]  # one, or by quantity
     rules = [rule for c in decided for rule in ([c] if "rule" in c else c.values())]
@@ -240,7 +241,6 @@ def describe_verdict(record: CalibrationRecord) -> Iterator[Element]:
         yield budget["finding"]["text"]
         yield build_share_table(budget)
     judged = [f for f in record.findings if f["code"].startswith(CONFORMITY)]
-    yield from list_findings(judged)
     if judged and record.validation is not None:
         yield from filter(None, [describe_commanded(record.validation)])
     yield from list_findings(f for f in select_important(record.findings) if f not in judged)
@@ -414,7 +414,8 @@ def describe_residuals(record: CalibrationRecord) -> Iterator[Element | None]:
     if record.converged and fit["degrees"]:
         square, degrees = (format_number(fit[key], 4) for key in ("chi_square", "degrees"))
         p_value = format_number(fit["p_value"], 2)
-        yield f"Chi-square is {square} with {degrees} degrees of freedom (p = {p_value})."
+        u = fit["sigma_uncertainty"] if fit["noise"] == "given" else 0.0
+        yield say("residuals.test", square=square, degrees=degrees, p_value=p_value, u=u)
     of_residuals = (f for f in record.findings if not f["code"].startswith(OF_PARAMETERS))
     yield from list_findings(f for f in of_residuals if f["code"].startswith(OF_RESIDUALS))
 
