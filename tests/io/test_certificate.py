@@ -336,7 +336,7 @@ def test_commands_print_facts_and_certificate(tmp_path, run, capsys) -> None:
 
 @pytest.mark.parametrize(("degrees", "factor"), [(np.inf, 2.45), (10.0, 2.86)])
 def test_region_of_parameters_counts_the_degrees_of_freedom(degrees, factor) -> None:
-    """JCGM 102, 6.5: sqrt(2 F) of 2 and 10 degrees of freedom, and sqrt(chi-square) of known noise."""
+    """JCGM 102, 6.5: sqrt(2 F) of 2 and 10 degrees, sqrt(chi-square) of known noise."""
     parameters = [
         {"name": name, "si:real": {"si:value": "1", "si:unit": r"\metre"}} for name in "ab"
     ]

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """A digital calibration certificate of a run: the XML of PTB's schema, DCC 3.3.0, with D-SI values.
 
-Every value is in SI, with its expanded uncertainty (coverage probability 95 %). The certificate states what the run states: parameters, errors at held-out
-poses and in a volume, conformity with limits, and the instruments. Elements and their order:
-https://ptb.de/dcc/v3.3.0/; the values: https://ptb.de/si/v2.2.1/.
+Every value is in SI, with its expanded uncertainty (coverage probability 95 %). The certificate
+states what the run states: parameters, errors at held-out poses and in a volume, conformity with
+limits, and the instruments. Elements and their order: https://ptb.de/dcc/v3.3.0/; the values:
+https://ptb.de/si/v2.2.1/.
 """
 
 from __future__ import annotations
