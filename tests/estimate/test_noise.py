@@ -102,6 +102,18 @@ def test_contradicted_sigmas_are_replaced_by_those_of_the_residuals(factor):
     assert test.sigma_scale**2 == pytest.approx(test.chi_square / 48.0)
 
 
+@pytest.mark.parametrize(("rows", "is_replaced"), [(6, False), (9, True)])
+def test_few_residuals_that_are_small_by_chance_replace_no_sigma(rows, is_replaced):
+    """Of two degrees of freedom, one fit in 2000 leaves 2 % of the noise: no instrument is that."""
+    A = np.random.default_rng(3).normal(size=(rows, 4))
+    left = np.linalg.svd(A)[0][:, 4:] @ np.full(rows - 4, 0.02)
+    factor = np.asarray(np.linalg.qr(np.column_stack([A, left]), mode="r"))[None]
+    d = decompose(factor, np.array([float(rows)]))
+    test = run_residual_test(d, np.zeros((1, 4)), "given")
+    assert test.degrees == rows - 4
+    assert (test.sigma_scale < 0.1) == is_replaced
+
+
 def test_computed_values_without_noise_keep_the_stated_sigma():
     """Residuals of exactly zero would state no uncertainty, and divide by zero."""
     data = hexapod_data(15)

@@ -222,8 +222,15 @@ def test_a_height_map_of_reprapfirmware() -> None:
         (
             "config.g",
             "G31 Z2\n" + 2 * "G1 X0 Y0\nG30 S-1\n" + "Stopped at height 2 mm\n",
-            "has 1 height, but the files have 2 points",
+            "report.txt:3: The log has no 'Stopped at height ..' for this G30",
         ),
+        (
+            "config.g",
+            "G31 Z2\nG1 X0 Y0\nG30 S-1\n" + 2 * "Stopped at height 2 mm\n",
+            "has 2 heights, but the files have 1 point",
+        ),
+        ("config.g", "Stopped at height 2,153 mm\n", "report.txt:1: loopcal cannot read"),
+        ("config.g", "Stopped at height 2153\n", "'Stopped at height 2.153 mm' with"),
         (
             "config.g",
             "Calibrated 6 factors using 13 points, deviation\n",
@@ -305,6 +312,63 @@ def test_what_heights_cannot_show_of_the_probe_is_said(config, shift, words, cap
     assert words in " ".join(capsys.readouterr().out.split())
 
 
+@pytest.mark.parametrize("front", ["Recv: echo:  ", "[10:12:31] >>> ", "2026-11-30 10:12:31,5 - "])
+def test_a_terminal_may_write_times_and_directions_in_front_of_the_configuration(front) -> None:
+    robot, truth = make_truth("m503.gcode")
+    write_points(POINTS, probe(robot, truth, POINTS))
+    Path("m503.gcode").write_text("".join(f"{front}{line}\n" for line in MARLIN.splitlines()))
+    assert run("import m503.gcode --probes report.txt -o p.yaml --data h.csv") == 0
+    np.testing.assert_array_equal(lc.load_robot("p.yaml").values, robot.values)
+
+
+@pytest.mark.parametrize(
+    ("stored", "times", "change", "words"),
+    [
+        (
+            "",
+            ("", ""),
+            0.3,
+            "13 points were probed several times. The heights of one differ by 0.3",
+        ),
+        ("", ("2026-11-30 09:40:01 ", "2026-12-02 08:00:00 "), 0.0, "from 2026-11-30 and 2026-12"),
+        (
+            "; M500 at 2026-11-30 10:15\n",
+            2 * ("2026-11-30 09:40:01 ",),
+            0.0,
+            "from 2026-11-30 10:15",
+        ),
+        ("; M500 at 2026-11-29 10:15\n", 2 * ("2026-11-30 09:40:01 ",), 0.0, ""),
+    ],
+)
+def test_runs_that_may_belong_to_other_numbers_are_named(
+    stored, times, change, words, capsys
+) -> None:
+    Path("m503.gcode").write_text(stored + MARLIN + "M851 X0 Y0 Z0\n")
+    heights = [0.1 * np.sin(k) for k in range(len(POINTS))]
+    write_points(POINTS, heights, "a.txt", "{}", times[0] + G30[1])
+    write_points(POINTS, [h + change for h in heights], "b.txt", "{}", times[1] + G30[1])
+    assert run("import m503.gcode --probes a.txt --probes b.txt -o p.yaml --data h.csv") == 0
+    out = " ".join(capsys.readouterr().out.split())
+    assert words in out
+    assert words or not any(text in out for text in ("several times", "from 2026"))
+
+
+def test_end_stops_that_a_file_lacks_are_assumed_and_all_are_written(capsys) -> None:
+    Path("m503.gcode").write_text(MARLIN.splitlines()[0] + "\n")
+    _, truth = make_truth("m503.gcode")
+    assert "lacks M666" in " ".join(capsys.readouterr().out.split())
+    lc.save_robot(truth, "true.yaml")
+    assert run("export true.yaml --format marlin --into m503.gcode -o new.gcode") == 0
+    words = Path("new.gcode").read_text().splitlines()[-1].split()
+    assert [word[:1] for word in words] == ["M", "X", "Y", "Z"]
+
+
+def test_a_report_in_place_of_the_configuration_is_named(capsys) -> None:
+    write_points(POINTS, [0.0] * len(POINTS))
+    assert run("import report.txt --probes config.g -o p.yaml --data h.csv") == 1
+    assert "This is a probe report" in capsys.readouterr().err
+
+
 def test_height_maps_of_two_days_are_named(capsys) -> None:
     Path("config.g").write_text(REPRAP + "G31 X0 Y0 Z1\n")
     titles = "xmin,xmax,ymin,ymax,radius,xspacing,yspacing,xnum,ynum\n-30,30,-30,30,45,30,30,3,3\n"
@@ -333,8 +397,12 @@ def test_values_are_not_recommended_where_bed_or_probe_explain_heights_alone(
     line = "--probes report.txt -o printer.yaml --data heights.csv --sigma-height 0.015mm"
     assert run(f"import m503.gcode {line}") == 0
     assert run("calibrate printer.yaml heights.csv -o run") == 0
-    out = " ".join(capsys.readouterr().out.split())
-    assert f"Recommendation: {words}" in out
+    captured = capsys.readouterr()
+    assert f"Recommendation: {words}" in " ".join(captured.out.split())
+    assert ("first check the trigger height" in " ".join(captured.err.split())) == bool(shift)
+    assert run("export run --format marlin") == 0
+    noted = " ".join(capsys.readouterr().err.split())
+    assert f"does not recommend these values. {words}" in noted
     if slope:
         codes = {f["code"]: f for f in lc.load_run("run").result["findings"]}
         assert codes["workflow.height-tilt"]["data"]["tilt"]["value"] == pytest.approx(4.0, abs=0.4)

@@ -44,7 +44,7 @@ from loopcal.estimate.posterior import (
 )
 from loopcal.estimate.prior_inflation import PriorConflict, add_factor_uncertainty, run_prior_tests
 from loopcal.estimate.problem import Problem, problem_of
-from loopcal.estimate.residual_test import ResidualTest, run_residual_test
+from loopcal.estimate.residual_test import FEWEST_DEGREES, NOTABLE, ResidualTest, run_residual_test
 from loopcal.estimate.result import (
     History,
     Identification,
@@ -390,9 +390,10 @@ def report_noise(data: Measurements, robot: Mechanism, test: ResidualTest) -> Fi
             return test.finding
         sigmas = _list_sigmas(data, robot, test.sigma_scale)
         return report_finding("noise.assumed-replaced", sigmas=sigmas, dof=test.dof)
-    if test.degrees < 0.5 or np.isnan(test.p_value):
+    ratio = float(np.sqrt(test.chi_square / max(test.degrees, 0.5)))
+    is_chance = test.degrees < FEWEST_DEGREES and test.exact_p_value > 1.0 - NOTABLE
+    if test.degrees < 0.5 or np.isnan(test.p_value) or is_chance:
         return report_finding("noise.assumed-untested", sigmas=_list_sigmas(data, robot, 1.0))
-    ratio = float(np.sqrt(test.chi_square / test.degrees))
     return report_finding(
         "noise.assumed",
         sigmas=_list_sigmas(data, robot, ratio),

@@ -15,8 +15,8 @@ uncertainty. Only what this rejects contradicts the stated noise.
 
 Residuals that are larger or smaller than an exact sigma explains show the noise better than the
 statement does: then s is that of the residuals alone. An exact sigma is replaced by a larger one
-only, and none by residuals without noise, such as those of computed values. See
-docs/theory/uncertainty.md.
+only, and none by residuals without noise, such as those of computed values, or by residuals with
+fewer than FEWEST_DEGREES degrees of freedom. See docs/theory/uncertainty.md.
 """
 
 from __future__ import annotations
@@ -300,7 +300,8 @@ def _estimate_scale(
     p_value : of a larger `unexplained`, if the stated sigmas were exact. stated : nu0.
     """
     is_noise = degrees > 0 and unexplained > NO_NOISE**2 * degrees
-    is_too_large = p_value > 1.0 - SIGNIFICANCE and np.isfinite(stated) and is_noise
+    is_enough = is_noise and degrees >= FEWEST_DEGREES  # fewer are small by chance
+    is_too_large = p_value > 1.0 - SIGNIFICANCE and np.isfinite(stated) and is_enough
     if stated == 0.0 or p_value < SIGNIFICANCE or is_too_large:
         return (float(np.sqrt(unexplained / degrees)), degrees) if degrees > 0 else (np.nan, 0.0)
     if weighted or degrees <= 0 or np.isinf(stated):

@@ -718,7 +718,8 @@ def export(
         loaded = replace(loaded, tables=tables, stem=stem)
         is_whole = TableSize(*target.table).what in ("commands", "readings")
         moved = (*moved, noted) if is_whole else (noted,)  # heights and skews move no program
-    loaded = replace(loaded, is_for_people=output is None, findings=moved)
+    findings = (*loaded.findings, *moved)
+    loaded = replace(loaded, is_for_people=output is None, findings=findings)
     exported = export_robot(loaded, target, into)
     written: dict[Path, str] = {}
     if output is not None:

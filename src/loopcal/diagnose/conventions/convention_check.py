@@ -372,6 +372,8 @@ def _compare_interpretations(
             other_misfit=chosen.misfit,
             other_residuals=list_rms_residuals(chosen.comparison),
             is_consistent=chosen.misfit <= ALLOWED,
+            heights=interpretation.slip == UNDECLARED
+            and all(getattr(o.kind, "components", ()) == ("z",) for o in thinned.observations),
         )
         return ConventionCheck(misfit, interpretation, chosen.misfit, alternatives, finding)
     if against is not None:

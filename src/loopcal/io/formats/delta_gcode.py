@@ -157,7 +157,10 @@ def get_geometry(source: ExportSource, format_name: str, decimals: int) -> Delta
 
 
 COMMAND = re.compile(r"\s*([GM]\d+)(?![\d.])")
-FRONT = re.compile(r"\s*(?:ECHO:)?\s*(?:N\s*\d+)?")
+# What a terminal (time, Recv:, >>>) and the firmware (echo:) write in front of a command.
+FRONT = re.compile(
+    r"[\s\[\]\d\-:.,]*(?:(?:RECV|SEND)\s*:|[<>]+)?\s*(ECHO:)?\s*(?:N\s*\d+)?", re.IGNORECASE
+)
 WORD = re.compile(r"\s*([A-Z])[ \t]*(\{[^}]*\}|[^A-Z\s{]*)")
 ASIDE = re.compile(r'"[^"]*"?|;.*|\([^)]*\)?')
 CHECKSUM = re.compile(r"\*\s*\d*\s*$")
@@ -286,7 +289,7 @@ class DeltaFirmware:
         rod, front = file.values.get(("M665", "L")), file.commands["M665"][0]
         if self.has_trims and rod is not None and ":" in rod.text:
             return "a list of lengths in M665 L", rod.line
-        if not self.has_trims and re.match(r"\s*echo:", file.lines[front], re.IGNORECASE):
+        if not self.has_trims and FRONT.match(file.lines[front])[1]:
             return "'echo:' in front of M665", front
         known = ((c, file.commands[c][0]) for c in self.others[2] if c in file.commands)
         return next(known, None)
@@ -382,6 +385,8 @@ class DeltaFirmware:
         )
         offset = self.get_probe_offset(file)
         findings = (report_finding("files.probe-offset", offset=offset),) if offset else ()
+        if "M666" not in file.commands:
+            findings += (report_finding("files.stops-assumed"),)
         program = f"M665 and M666 of {self.program}"
         text = format_robot(geometry, options, path, program, has_distances=False)
         if not options.probes:
@@ -410,7 +415,8 @@ class DeltaFirmware:
         if is_new or not is_same(*zip(self.parse_arms(file), geometry.arms, strict=True)):
             words = arms | words
         zeros = {("M665", letter): 0.0 for letter in TOWERS + TRIMS}
-        zeros |= {("M666", letter): 0.0 for letter in TOWERS}
+        if "M666" in file.commands:  # otherwise its words may have other values in the printer
+            zeros |= {("M666", letter): 0.0 for letter in TOWERS}
         if source.is_for_people and is_new:
             words = shorten_numbers(words, self.decimals)
         return file.export(into, words, zeros, findings)

@@ -14,17 +14,20 @@ from pathlib import Path
 from typing import Any, Literal
 
 from loopcal.errors import DataError, FileError, MechanismError
-from loopcal.findings import Finding, report_finding
+from loopcal.findings import Finding, Severity, report_finding
 from loopcal.io.core.csv_table import format_columns, format_scaled
-from loopcal.io.core.text_file import write_text
+from loopcal.io.core.text_file import read_text, write_text
 from loopcal.io.core.yaml_file import parse_yaml
 from loopcal.io.data.measurement_file import save_measurements
 from loopcal.io.formats import FORMATS
+from loopcal.io.formats.probe_reports import ANSWER
 from loopcal.io.formats.program_format import Exported, ExportSource, Format, Imported
 from loopcal.io.robot.robot_file import build_robot, load_robot
 from loopcal.io.runs.run_folder import Run
 from loopcal.mechanism.model import Mechanism
 from loopcal.units import find_unit
+
+APPLY = "values.apply"  # begin of the codes of recommendations to use the values
 
 
 def list_formats(ability: Literal["read", "write"]) -> tuple[str, ...]:
@@ -41,6 +44,8 @@ def choose_format(path: Path, name: str | None, *, is_written: bool = False) -> 
     for entry in FORMATS.values():
         if path.suffix.lower() in entry.endings:
             return entry
+    if not is_written and path.is_file() and ANSWER.search(read_text(path, "G-code file")):
+        raise FileError(report_finding("files.report-first"), path)
     names = list_formats("write" if is_written else "read")
     raise FileError(report_finding("files.format-unknown", formats=names), path)
 
@@ -66,7 +71,11 @@ def save_imported(path: Path, imported: Imported, output: Path, data: Path | Non
     robot = build_imported_robot(path, imported)
     if data is not None:
         if imported.measurements is None:
-            raise DataError(report_finding("files.no-measurements", file=str(path)))
+            reason = " ".join(
+                str(f) for f in imported.findings if f.severity is Severity.SUGGESTION
+            )
+            finding = report_finding("files.no-measurements", file=str(path), reason=reason)
+            raise DataError(finding)
         save_measurements(imported.measurements, data, robot, f"read from {path.name}")
     write_text(output, imported.robot_text)
     return load_robot(output)
@@ -81,7 +90,11 @@ def build_source(run: Run) -> ExportSource:
         for i, row in enumerate(rows)
         if row["plus_minus"] is None
     }
-    return ExportSource(run.robot, {row["name"]: row["plus_minus"] for row in rows}, reasons)
+    advice = run.result.get("recommendation") or {"code": APPLY}
+    told = () if advice["code"].startswith(APPLY) else (advice["text"],)
+    doubts = tuple(report_finding("files.values-not-recommended", reason=text) for text in told)
+    stated = {row["name"]: row["plus_minus"] for row in rows}
+    return ExportSource(run.robot, stated, reasons, findings=doubts)
 
 
 def export_robot(source: ExportSource, target: Format, into: Path | None) -> Exported:

@@ -33,7 +33,7 @@ import numpy as np
 from loopcal.errors import DataError, FileError
 from loopcal.findings import Quantity, report_finding
 from loopcal.io.core.csv_table import parse_finite
-from loopcal.io.core.yaml_file import format_yaml
+from loopcal.io.core.yaml_file import format_yaml, parse_yaml
 from loopcal.io.formats.delta_gcode import (
     NOMINAL_ANGLES,
     DeltaGeometry,
@@ -41,6 +41,7 @@ from loopcal.io.formats.delta_gcode import (
     get_geometry,
     report_kinematics,
 )
+from loopcal.io.formats.probe_reports import check_heights
 from loopcal.io.formats.program_format import (
     DECIMALS,
     MM,
@@ -57,6 +58,7 @@ from loopcal.io.formats.program_format import (
     round_length,
     shorten_numbers,
 )
+from loopcal.io.robot.robot_file import build_robot
 
 STEPPERS = ("stepper_a", "stepper_b", "stepper_c")
 PROBED = "delta_calibrate"
@@ -172,6 +174,7 @@ def read(path: Path, options: ImportOptions) -> Imported:
     from loopcal.measure.kinds.distance import Separation
     from loopcal.measure.kinds.poses import Component
     from loopcal.measure.measurements import Measurements
+    from loopcal.mechanism.solutions import forward
 
     cfg, ends = read_config(path), ("_pos1", "_pos2")
     sorts = ("height", "manual_height")
@@ -210,7 +213,12 @@ def read(path: Path, options: ImportOptions) -> Imported:
     )
     readings = np.array(list(positions.values())) * np.array(steps) * (1.0 if is_rotary else MM)
     measurements = Measurements(options.name, readings, observations, labels=labels)
-    return Imported(text, measurements, (finding,))
+    robot = build_robot(parse_yaml(text, path, "robot file"))
+    reached = forward(robot, readings[rows]).T[:, 2, 3] - [values[record] for record in heights]
+    offset = next((n for n in cfg.values if n[1] == "z_offset"), None)
+    trigger = None if offset is None else cfg.number(*offset)
+    noted = check_heights(reached / MM, trigger, "klipper", path) if heights else []
+    return Imported(text, measurements, (finding, *noted))
 
 
 def parse_geometry(cfg: KlipperConfig) -> DeltaGeometry:

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -47,19 +47,25 @@ HEIGHTS = re.compile(
     r"\bG32 bed probe heights:(.*?)(?:,\s*mean|$)|\bBed probe heights:(.*?),\s*mean", re.IGNORECASE
 )
 POINT = re.compile(rf"^\s*(?:N\d+\s*)?G30(?!\d)(?=.*P(\d+))(?=.*X\s*{NUMBER})(?=.*Y\s*{NUMBER})")
-STOPPED = re.compile(rf"Stopped at height\s*{NUMBER}\s*mm")
+STOPPED = re.compile(r"Stopped at height\s*(.*)")
+STOP_HEIGHT = re.compile(rf"{NUMBER}\s*mm\b")
 MOVE = re.compile(r"(?<![A-Z\d])G0*[01](?!\d)(.*)")
 # A G30 that reports the height at which it stops, at the place of the last move.
 TOUCHING = re.compile(r"(?<![A-Z\d])G30(?!\d)(?!.*P\s*\d).*S\s*-1(?!\d)")
 CALIBRATED = re.compile(r"Calibrated (\d+) factors using")
 HEIGHT_MAP = "RepRapFirmware height map file"
-GENERATED = re.compile(r"generated at (\d{4}-\d\d-\d\d)")
+DATE = re.compile(r"(?<!\d)20\d\d-\d\d-\d\d(?!\d)(?:[ T]\d\d:\d\d)?")
+# What only an answer of a firmware contains, not the macro or the configuration beside it.
+ANSWER = re.compile(rf"Bed X:|bed probe heights:|Stopped at height|{HEIGHT_MAP}", re.IGNORECASE)
 # Command that states where the probe is beside the nozzle, and the height at which it triggers.
 OFFSETS = {"marlin": re.compile(r"\bM851\b(.*)"), "reprap": re.compile(r"\bG31\b(.*)")}
 # Median deviation of heights from their median [mm] beyond which their unit is another one.
 ROUGH = 5.0
-# Median height [mm] from which a wrong trigger height is as probable as wrong end stops.
-SHIFTED = 1.0
+# Median height [mm] from which a wrong trigger height is as probable as wrong end stops, and beyond
+# which neither explains it.
+SHIFTED, FARTHEST = 1.0, 100.0
+# Difference of two heights of one point, in sigmas of the probe, that its scatter does not explain.
+DIFFERENT = 8.0
 
 
 class ProbedPoint(NamedTuple):
@@ -93,7 +99,14 @@ def import_probes(
         finding = report_finding("files.probes-too-few", count=len(points), least=FEWEST)
         raise FileError(finding, first)
     heights = np.array([p.height for p in points])
-    noted += _check_heights(heights, probe, firmware, first)
+    stored = max(DATE.findall(read_text(path, "G-code file")), default="")
+    reports = (read_text(file, "probe report") for file in options.probes)
+    probed = max(_list_times(reports), default="")
+    if probed and stored[: len(probed)] > probed[: len(stored)]:
+        facts = {"stored": stored, "probed": probed}
+        noted.append(report_finding("files.configuration-later", **facts))
+    noted += check_heights(heights, probe.get("Z"), firmware, first)
+    noted += _compare_repeats(points, options.choose_noise("height") / MM)
     names = [p.name for p in points]
     are_names = len(set(names) - {""}) == len(names)
     labels = tuple(n if are_names else f"{i}-{n}" if n else str(i) for i, n in enumerate(names, 1))
@@ -131,9 +144,17 @@ def read_reports(
     x, y = probe.get("X", 0.0), probe.get("Y", 0.0)
     points = [p._replace(x=p.x - x, y=p.y - y) for p in probed]
     points += touched if firmware == "reprap" or not probed else []
+    dates = sorted({time[:10] for time in _list_times(texts.values())})
+    if len(dates) > 1:
+        noted.append(report_finding("files.reports-of-dates", dates=dates))
     if not points:
         raise FileError(report_finding("files.no-probe-report", firmware=firmware), paths[0])
     return points, noted
+
+
+def _list_times(reports: Iterable[str]) -> list[str]:
+    """Return the dates that reports state, with their times, if any."""
+    return [time for text in reports if ANSWER.search(text) for time in DATE.findall(text)]
 
 
 def _read_probe(paths: Sequence[Path], firmware: str) -> dict[str, float]:
@@ -148,27 +169,47 @@ def _read_probe(paths: Sequence[Path], firmware: str) -> dict[str, float]:
     return stated
 
 
-def _check_heights(
-    heights: FloatArray, probe: Mapping[str, float], firmware: str, path: Path
+def check_heights(
+    heights: FloatArray, stated: float | None, firmware: str, path: Path
 ) -> list[Finding]:
-    """Return whether all heights (n,) [mm] are shifted; FileError where they are no millimeters."""
+    """Return whether all heights (n,) [mm] are shifted, with the trigger height [mm] that a file
+    has; FileError where reported ones are no millimeters. Klipper's follow from motor steps.
+    """
     shift = float(np.median(heights))
-    if float(np.median(np.abs(heights - shift))) > ROUGH:
+    if float(np.median(np.abs(heights - shift))) > ROUGH or abs(shift) > FARTHEST:
         least, largest = (Quantity(float(h), "mm") for h in (heights.min(), heights.max()))
-        raise FileError(report_finding("files.heights-unit", least=least, largest=largest), path)
+        facts = {"least": least, "largest": largest, "firmware": firmware}
+        level = Severity.WARNING if firmware == "klipper" else Severity.REFUSAL
+        finding = report_finding("files.heights-unit", level, **facts)
+        if level is Severity.REFUSAL:
+            raise FileError(finding, path)
+        return [finding]
     rest = float(np.sqrt(((heights - heights.mean()) ** 2).mean()))
     if abs(shift) < max(SHIFTED, 3.0 * rest):
         return []
-    trigger = probe.get("Z", 0.0) if firmware == "reprap" else -probe.get("Z", 0.0)
+    trigger = (stated or 0.0) * (-1.0 if firmware == "marlin" else 1.0)
     finding = report_finding(
         "files.heights-shifted",
         shift=Quantity(shift, "mm"),
         rest=Quantity(rest, "mm"),
         firmware=firmware,
-        stated=probe.get("Z"),
+        stated=stated,
         is_twice=abs(shift + 2.0 * trigger) < max(0.1 * abs(shift), rest),
     )
     return [finding]
+
+
+def _compare_repeats(points: Sequence[ProbedPoint], sigma: float) -> list[Finding]:
+    """Return whether points that were probed again have other heights; sigma [mm] of the probe."""
+    heights: dict[tuple[float, float], list[float]] = {}
+    for p in points:
+        heights.setdefault((round(p.x, 1), round(p.y, 1)), []).append(p.height)
+    spans = [max(of_point) - min(of_point) for of_point in heights.values() if len(of_point) > 1]
+    largest = max(spans, default=0.0)
+    if not largest > DIFFERENT * sigma:
+        return []
+    facts = {"count": len(spans), "largest": Quantity(largest, "mm"), "ratio": largest / sigma}
+    return [report_finding("files.probes-differ", **facts)]
 
 
 def _parse_point(match: re.Match[str], path: Path, line: int) -> ProbedPoint:
@@ -198,8 +239,7 @@ def _read_marlin(
                     raise FileError(report_finding("files.g33-unusable", reason=reason), path, i)
                 radius = parse_number(dry[1], "the radius", path, i)
             elif TOUCH.search(line):
-                finding = report_finding("files.probe-line-unreadable", line=line.strip())
-                raise FileError(finding, path, i)
+                raise _report_unreadable(line, "marlin", path, i)
             elif radius is not None and line.startswith("."):
                 for name, height in () if SETTING.search(line) else PART.findall(line):
                     angle = math.radians(AROUND.get(name, 0.0))
@@ -245,9 +285,6 @@ def _read_reprap(
         if alone:
             raise FileError(finding, path, number)
         noted.append(finding)
-    dates = {match[1] for text in texts.values() if (match := GENERATED.search(text))}
-    if len(dates) > 1:
-        noted.append(report_finding("files.reports-of-dates", dates=sorted(dates)))
     return probed, stopped, noted
 
 
@@ -281,8 +318,9 @@ def _read_stops(texts: Mapping[Path, str], probe: Mapping[str, float]) -> list[P
     """
     places: list[dict[str, float]] = []
     stops: list[tuple[Path, int, float]] = []
+    unanswered: list[tuple[Path, int]] = []
     for path, text in texts.items():
-        place: dict[str, float] = {}
+        place, open_lines = dict[str, float](), list[int]()
         for i, line in enumerate(text.splitlines(), 1):
             code = line.partition(";")[0].upper()
             if match := MOVE.search(code):
@@ -290,11 +328,18 @@ def _read_stops(texts: Mapping[Path, str], probe: Mapping[str, float]) -> list[P
                 place |= {n: parse_number(word[1], n, path, i) for n, word in words if word}
             if TOUCHING.search(code):
                 places.append(dict(place))
+                open_lines.append(i)
             if match := STOPPED.search(line):
-                stops.append((path, i, parse_number(match[1], "the height", path, i)))
+                if not (height := STOP_HEIGHT.match(match[1])):
+                    raise _report_unreadable(line, "reprap", path, i)
+                stops.append((path, i, parse_number(height[1], "the height", path, i)))
+                unanswered += [(path, line) for line in open_lines[:-1]]
+                open_lines = []
     if not stops:
         return []
     finding = None
+    if unanswered and len(places) - len(stops) == len(unanswered):
+        raise FileError(report_finding("files.probe-unanswered"), *unanswered[0])
     if len(places) != len(stops):
         finding = report_finding("files.g32-too-few", count=len(stops), points=len(places))
     elif any(len(place) < 2 for place in places):
@@ -305,6 +350,12 @@ def _read_stops(texts: Mapping[Path, str], probe: Mapping[str, float]) -> list[P
         raise FileError(finding, *stops[0][:2])
     pairs = zip(places, stops, strict=True)
     return [ProbedPoint(p["X"], p["Y"], height - probe["Z"]) for p, (*_, height) in pairs]
+
+
+def _report_unreadable(line: str, firmware: str, path: Path, number: int) -> FileError:
+    """Return the error of a line that reports a point without a number that can be read."""
+    finding = report_finding("files.probe-line-unreadable", line=line.strip(), firmware=firmware)
+    return FileError(finding, path, number)
 
 
 def _read_height_map(path: Path, text: str) -> list[ProbedPoint]:

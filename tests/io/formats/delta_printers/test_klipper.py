@@ -96,3 +96,25 @@ def test_all_records_of_a_complete_file_are_read(tmp_path) -> None:
     imported = klipper.read(tmp_path / "full.cfg", ImportOptions("full"))
     assert imported.measurements is not None
     assert [len(rows) for rows in imported.measurements.observations] == [6, 2]
+
+
+@pytest.mark.parametrize(
+    ("height", "offset", "words"),
+    [
+        (1500.0, "1.5", "Are they in micrometers? Or have microsteps"),
+        (-2.0, "-2", "twice Z-2 of the file: its sign is probably wrong. z_offset is positive"),
+        (2.0, "2", ""),
+    ],
+)
+def test_heights_far_from_the_bed_are_named(tmp_path, height, offset, words) -> None:
+    """The carriages stand where the nozzle triggers, 1.5 or 2 mm above the bed."""
+    steps = (300.0 - min(abs(height), 2.0)) * 80.0
+    lines = [f"height{i}: {height}\nheight{i}_pos: {steps},{steps},{steps}" for i in range(4)]
+    probe = f"[probe]\nz_offset: {offset}\n[delta_calibrate]"
+    path = tmp_path / "printer.cfg"
+    motors = "rotation_distance: 40\nmicrosteps: 16\n"
+    text = SHORT.replace("[stepper_b]\n", f"[stepper_b]\n{motors}")
+    path.write_text("\n".join([text + motors + probe, *lines]))
+    findings = klipper.read(path, ImportOptions("printer")).findings
+    assert words in " ".join(str(finding) for finding in findings[1:])
+    assert len(findings) == 1 + bool(words)
