@@ -180,13 +180,8 @@ def measure_sums(robot: Mechanism, weights: FloatArray) -> FloatArray:
     joint that has most of it, an angle at the size of the robot. Readings that are more than the
     freedoms count by their standard deviations, if these are known.
     """
-    program, units = robot.program, np.ones(robot.program.n_joints)
-    for group in program.groups:
-        for j in group.driven_joints:
-            if group.joints[j : j + 1] == "R":
-                units[group.actuator[j]] = program.size
     with np.errstate(divide="ignore"):
-        lengths = (1.0 / (np.abs(weights[0]) / units).max(axis=1)).clip(max=1e12)
+        lengths = (1.0 / (np.abs(weights[0]) / robot.joint_units).max(axis=1)).clip(max=1e12)
     readings = np.array([row.column is None for row in robot.assembly.rows[-len(lengths) :]])
     if robot.has_redundant_sums and readings.any():
         rows = [row for row in robot.assembly.rows if row.column is None]

@@ -282,6 +282,11 @@ class Assembly:
         return tuple(dict.fromkeys(name for a in self.rows for name in a.driven_joints))
 
     @cached_property
+    def turning_drives(self) -> frozenset[str | None]:
+        """Names of the drives, and of coupled joints, that turn a joint."""
+        return frozenset(j.actuator for limb in self.limbs for j in limb.joints if j.kind == "R")
+
+    @cached_property
     def passive_joints(self) -> tuple[tuple[Limb, Joint], ...]:
         """Joints whose value is no reading, with their limbs: passive ones, also in couplings, and
         pins of triangles that a linear actuator turns.

@@ -160,7 +160,7 @@ def _close_at_home(
     if idle:
         groups, places, count = _group_limbs(assembly, slots, idle)
         guess = _make_first_guess(assembly, groups)
-    _check_sums(assembly, freedoms)
+    _check_compliances(assembly, freedoms)
     findings = []
     for limb, joint in ((assembly.limbs[i], j) for i in sorted(idle) for j in idle[i]):
         locked = limb.joints[joint]
@@ -355,24 +355,15 @@ def _weigh_actuators(
     return None if has_sums else tuple(s / max(sigma) for s in sigma)
 
 
-def _check_sums(assembly: Assembly, freedoms: tuple[int, ...]) -> None:
-    """Refuse sums whose numbers of readings, joints and freedoms do not fit, and compliances where
-    the load does not determine the forces of the drives.
-    """
-    a, joints, m = len(assembly.rows), len(assembly.driven_joints), len(freedoms)
+def _check_compliances(assembly: Assembly, freedoms: tuple[int, ...]) -> None:
+    """Refuse compliances where the load does not determine the forces of the drives."""
+    a, m = len(assembly.rows), len(freedoms)
     elastic = [own.name for own in assembly.actuators if own.name.startswith(LOAD)]
     if elastic and (assembly.closure != "exact" or (a > m and not assembly.couplings)):
         why = f"{a} drives for {m} freedoms" if a > m else "over-constrained loops"
         raise MechanismError(
             f"{assembly.name} has {why}, so the load does not determine the forces of its drives; "
             f"leave out the compliance of {elastic[0].removeprefix(LOAD)!r}"
-        )
-    if assembly.couplings or not any(own.weights for own in assembly.rows):
-        return
-    if a < m and a != joints:
-        raise MechanismError(
-            f"{assembly.name} has {a} readings of {joints} driven joints for {m} freedoms, so its "
-            "sums do not hold the platform. Give one reading for every freedom"
         )
 
 
@@ -577,8 +568,7 @@ def _check_chain(robot: Mechanism, home: State) -> None:
     _, tau = robot.slots(values)
     q = readings_from_joints(driven_values(robot.program, home), tau, robot.slots.constants)
     D = differentiate_pose(robot, values, q, home).readings[0, 0][:, moving]
-    turning = np.array([a.dimension is Dimension.ANGLE for a in robot.actuators])[moving]
-    scaled = D * robot.twist_scale[:, None] / np.where(turning, robot.size, 1.0)
+    scaled = D * robot.twist_scale[:, None] / robot.reading_units[moving]
     freedoms = count_rank(np.linalg.svd(scaled, compute_uv=False))
     c, a = len(robot.controlled), len(moving)
     if not freedoms <= c <= a:

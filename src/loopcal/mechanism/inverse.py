@@ -437,13 +437,11 @@ def _make_rows(robot: Mechanism, values: FloatArray, target: FloatArray) -> _Row
     turns: list[bool] = []
     for stage in stages:
         assembly = stage.robot.assembly
-        joints = (joint for limb in assembly.limbs for joint in limb.joints)
-        turning = {joint.actuator for joint in joints if joint.kind == "R"}
         drives = [(name,) for name in assembly.driven_joints]
         if stage.robot.has_open_sums or assembly.couplings:
             drives = [actuator.driven_joints for actuator in assembly.actuators]
         drives += [()] * (len(assembly.actuators) - len(drives))  # conditions
-        turns += [not turning.isdisjoint(names) for names in drives]
+        turns += [not assembly.turning_drives.isdisjoint(names) for names in drives]
     return _Rows(
         robot,
         values,

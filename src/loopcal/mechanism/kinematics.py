@@ -254,7 +254,6 @@ def forward_trials(
     q: FloatArray,
     start: State | None = None,
     follow: bool = True,
-    goal: State | None = None,
     driven: DrivenJoints | None = None,
 ) -> State:
     """Solve forward kinematics for readings q (t | 1, n, a) and values (t | 1, p).
@@ -263,9 +262,8 @@ def forward_trials(
     singularity, is solved again along the straight path from the start's readings. Rows that still
     fail are marked, see `Status`. Redundant readings contradict each other by their errors; a row
     that they leave wide open is solved again too, and marked if it stays open. Without `follow` all
-    these rows are marked at once, in a fraction of the time. With a `goal` (t, n), a row that comes
-    close to it ends there as `engine.NEAR_GOAL`. `driven` is that of `drive_joints`, where it is
-    known.
+    these rows are marked at once, in a fraction of the time. `driven` is that of
+    `drive_joints`, where it is known.
     """
     if not q.shape[1]:
         return without_poses(robot.home_state, max(len(values), len(q)))
@@ -276,7 +274,7 @@ def forward_trials(
         ]
         return join_stage_states(robot, states)
     loops, joints = drive_loops(robot, values, q, driven)
-    state = loops.close(joints, start, follow, goal)
+    state = loops.close(joints, start, follow)
     if not len(find_triangles(robot.slots.terms[None])):
         return state
     _, tau = robot.slots(values)

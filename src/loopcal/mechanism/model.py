@@ -375,6 +375,18 @@ class Mechanism(DrawnResult):
         return is_serial(self.assembly) and not self.has_open_sums
 
     @cached_property
+    def joint_units(self) -> FloatArray:
+        """Lengths (J,) [m] that a unit of each driven joint counts for, an angle at the size."""
+        turns = [name in self.assembly.turning_drives for name in self.assembly.driven_joints]
+        return np.where(turns, self.size, 1.0)
+
+    @cached_property
+    def reading_units(self) -> FloatArray:
+        """Lengths (a,) [m] that a unit of each reading counts for, an angle at the size."""
+        turns = [actuator.dimension is Dimension.ANGLE for actuator in self.actuators]
+        return np.where(turns, self.size, 1.0)
+
+    @cached_property
     def has_sums(self) -> bool:
         """Whether a reading is a weighted sum of joint values, or joints are coupled."""
         return any(row.weights for row in self.assembly.rows)

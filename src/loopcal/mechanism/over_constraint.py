@@ -258,7 +258,7 @@ def find_nearby_states(robot: Mechanism) -> State:
     home, rng = robot.home_state, np.random.default_rng(0)
     nominal = robot.parameters.nominal[None]
     q = compute_readings(robot, nominal, home)
-    turns = {j.actuator for limb in robot.assembly.limbs for j in limb.joints if j.kind == "R"}
+    turns = robot.assembly.turning_drives
     unit = np.array([1.0 if a.name in turns else robot.size for a in robot.actuators])
     shifts = DISTANCE * unit * rng.uniform(-1.0, 1.0, (NEARBY, len(unit)))
     near = forward_trials(robot, nominal, q + shifts[None], follow=False)

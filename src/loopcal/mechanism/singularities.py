@@ -39,7 +39,6 @@ from loopcal.mechanism.workspace import sample_workspace
 from loopcal.numerics.statistics import compute_median
 from loopcal.results.result import Result
 from loopcal.typing import BoolArray, FloatArray, IntArray
-from loopcal.units import Dimension
 
 # Share of the median margin below which a pose is close to a singularity (rule of thumb).
 NEAR_SHARE = 0.1
@@ -271,12 +270,11 @@ def _scale_closure(robot: Mechanism, state: State) -> tuple[FloatArray, FloatArr
     zero where a number is not finite, and where all are finite (n,).
     """
     program, blocks = robot.program, linearize_state(robot, state)
-    turning = np.array([a.dimension is Dimension.ANGLE for a in robot.actuators])
     A, Q = (rows[0] for rows in reduce_to_platform(program, blocks))
     if robot.has_sums:
         A, Q = _sum_rows(robot, state, A, Q)
     A = A / robot.twist_scale[list(program.freedoms)]
-    Q = Q / np.where(turning[: Q.shape[2]], robot.size, 1.0)
+    Q = Q / robot.reading_units[: Q.shape[2]]
     good = np.asarray(np.isfinite(A).all(axis=(1, 2)) & np.isfinite(Q).all(axis=(1, 2)))
     return np.where(good[:, None, None], A, 0.0), np.where(good[:, None, None], Q, 0.0), good
 
@@ -329,8 +327,7 @@ def _compute_chain_margins(
     T, names = state.T[0], robot.controlled
     _, columns = compare_coordinates(T, read_coordinates(T, names), names, robot.size)
     moving = find_carrying_actuators(robot)
-    turning = np.array([a.dimension is Dimension.ANGLE for a in robot.actuators])[moving]
-    slope = np.matmul(columns, D[..., moving]) / np.where(turning, robot.size, 1.0)
+    slope = np.matmul(columns, D[..., moving]) / robot.reading_units[moving]
     good = np.isfinite(slope).all(axis=(1, 2))
     _, r, W = np.linalg.svd(np.where(good[:, None, None], slope, 0.0))
     drive_margin = np.where(good, r[:, -1], np.nan)

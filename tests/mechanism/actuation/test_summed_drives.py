@@ -525,7 +525,7 @@ SECOND, THIRD = "q2: {reads: length, sum: {m: 1, k: 2}}", "q3: {reads: length, s
         ("[weight.n]", "[wait.n]", "no term 'wait.n'", None),
         (f"  {THIRD}\n", "", "'h' of limb 'H' is in no sum", 8),
         (f"  {SECOND}\n  {THIRD}\n", "  q2: {reads: length, sum: {k: 1, h: 2}}\n",
-         "2 readings of 4 driven joints for 3 freedoms", None),
+         "it can move while all sums are constant", None),
         (THIRD, "q3: {reads: angle, sum: {n: 1, h: 2}}", "adds angles, but 'n' slides", None),
         (THIRD, "q3: {triangle: {foot: [1, 0, 0], head: [0, 1, 0]}}", "drives no joint", 10),
     ],

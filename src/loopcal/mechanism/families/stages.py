@@ -91,19 +91,11 @@ def check_stage_names(names: Sequence[str], parents: Sequence[str | None]) -> li
                 f"{suggest_names(on, names[:i])}. Allowed: {', '.join((BASE, *names[:i]))}",
                 i,
             )
-        path, under = [name], on
-        while under != BASE and under in names and under not in path:
-            path.append(under)
-            under = stated[names.index(under)]
-        if under == name:
-            raise StageError(
-                f"the stages form a cycle: {' on '.join([*path, under])}; attach one of them to "
-                f"{BASE!r} or to an earlier stage",
-                i,
-            )
         if on in names[i:]:
             raise StageError(
-                f"stage {name!r} is on {on!r}, which is listed behind it. List {on!r} first", i
+                f"stage {name!r} is on {on!r}, which is not an earlier stage. Attach it to "
+                f"{BASE!r} or to an earlier one, or list {on!r} first",
+                i,
             )
     return stated
 
