@@ -36,6 +36,13 @@ def test_every_family_and_kind_has_a_section() -> None:
         assert f"### `kind: {name}`\n" in PAGE
 
 
+def test_pages_count_kinds_and_shipped_robots(root) -> None:
+    changes = (root / "CHANGELOG.md").read_text("utf-8")
+    assert f"| {len(KINDS)} [kinds]" in changes
+    assert f"| {len(reference.list_shipped_robots())} shipped [robots]" in changes
+    assert f"| {len(KINDS)} kinds, mixed" in (root / "docs" / "coming-from.md").read_text("utf-8")
+
+
 def test_keys_have_type_default_and_description() -> None:
     found = {key.name: key for key in reference.list_keys(LinearDelta)}
     assert found["radius"] == reference.Key(
