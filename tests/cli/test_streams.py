@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Standard output that is closed or full costs no result, and what is said is true."""
 
+import io
 import os
 import subprocess
 import sys
@@ -9,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from loopcal.cli.entry_point import main
+from loopcal.cli.terminal import prepare_streams
 
 pytestmark = pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
 
@@ -56,3 +58,12 @@ def test_names_that_are_not_utf_8_are_written_and_recorded(tmp_path, monkeypatch
     assert sorted(path.name for path in Path().iterdir()) == sorted(
         [commands, data, run, "targets.csv"]
     )
+
+
+def test_a_closed_input_is_empty_and_other_encodings_can_be_read(monkeypatch) -> None:
+    monkeypatch.setattr(sys, "stdin", None)
+    prepare_streams()
+    assert sys.stdin.readline() == ""
+    monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(b"caf\xe9 1\n"), "utf-8"))
+    prepare_streams()
+    assert sys.stdin.readline() == "caf\\xe9 1\n"

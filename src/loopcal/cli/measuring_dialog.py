@@ -71,9 +71,13 @@ class Dialog(MeasuringSession):
         lines: queue.Queue[str | None] = queue.Queue()
 
         def read() -> None:
-            for line in iter(sys.stdin.readline, ""):
-                lines.put(line.strip())
-            lines.put(None)
+            try:
+                for line in iter(sys.stdin.readline, ""):
+                    lines.put(line.strip())
+            except OSError:  # of a terminal that is gone
+                pass
+            finally:
+                lines.put(None)
 
         threading.Thread(target=read, daemon=True).start()
         while True:

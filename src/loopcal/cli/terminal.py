@@ -112,21 +112,23 @@ def silence(stream: TextIO) -> None:
 
 def prepare_streams() -> None:
     """Replace standard streams that are closed, so that no output file takes their place, and let
-    other signs and escapes stand for characters that they cannot express.
+    other signs and escapes stand for characters that they cannot express or read.
     """
     for descriptor in range(3):
         try:
             os.fstat(descriptor)
         except OSError:
             os.open(os.devnull, os.O_RDWR)  # the lowest free descriptor, which is this one
-    for name in ("stdout", "stderr"):
-        if getattr(sys, name) is None:
-            stream = Path(os.devnull).open("w", encoding="utf-8")  # noqa: SIM115 until the end
-            setattr(sys, name, stream)
     codecs.register_error("loopcal", _express)
-    for stream in (sys.stdout, sys.stderr):
+    for name, mode, errors in (
+        ("stdin", "r", "backslashreplace"), ("stdout", "w", "loopcal"), ("stderr", "w", "loopcal")
+    ):  # fmt: skip
+        if getattr(sys, name) is None:
+            stream = Path(os.devnull).open(mode, encoding="utf-8")  # noqa: SIM115 until the end
+            setattr(sys, name, stream)
+        stream = getattr(sys, name)
         if isinstance(stream, TextIOWrapper) and stream.errors in ("strict", "backslashreplace"):
-            stream.reconfigure(errors="loopcal")
+            stream.reconfigure(errors=errors)
 
 
 def _express(error: UnicodeError) -> tuple[str | bytes, int]:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Read the rows that an instrument adds to its export while it measures.
 
-The export is read again from its beginning each time: what a line means may depend on a header
-above it. Only complete lines count, and of several targets only complete sets. If the beginning has
+An export that has changed is read again from its beginning: what a line means may depend on a
+header above it. Only complete lines count, and of several targets only complete sets. If the beginning has
 changed, the instrument began a new file, whose rows all count.
 """
 
@@ -28,14 +28,15 @@ class GrowingExport:
     """An export that grows, how it is read, and how far it was read.
 
     entry : kind and columns of the sheet that is filled in. by_order : whether names of points do
-    not count. size, digest : of the bytes that were read. rows, misfits : numbers of rows that were
-    read, and of lines that do not match the profile.
+    not count. state : of the file when it was read. size, digest : of the bytes that were read.
+    rows, misfits : numbers of rows that were read, and of lines that do not match the profile.
     """
 
     path: Path
     profile: Profile
     entry: KindRows
     by_order: bool = False
+    state: tuple[int, ...] = ()
     size: int = 0
     digest: str = ""
     rows: int = 0
@@ -54,8 +55,11 @@ class NewRows(NamedTuple):
 def read_new_rows(export: GrowingExport) -> NewRows:
     """Return the rows that an export got; none while it does not exist. FileError : unreadable."""
     path, kind = export.path, export.entry.kind
-    if not path.exists():
+    found = path.stat() if path.exists() else None
+    state = () if found is None else (found.st_ino, found.st_size, found.st_mtime_ns)
+    if state in ((), export.state):
         return NewRows(export)
+    export = replace(export, state=state)
     content, findings = read_bytes(path, "export", TABLE_SIZE), list[Finding]()
     one, two = (text.encode(export.profile.encoding) for text in ("x", "x\n"))
     mark = two[len(one) :]  # of the end of a line, without a byte order mark
