@@ -2,8 +2,8 @@
 """Read the rows that an instrument adds to its export while it measures.
 
 An export that has changed is read again from its beginning: what a line means may depend on a
-header above it. Only complete lines count, and of several targets only complete sets. If the beginning has
-changed, the instrument began a new file, whose rows all count.
+header above it. Only complete lines count, and of several targets only complete sets. If the
+beginning has changed, the instrument began a new file, whose rows all count.
 """
 
 from __future__ import annotations
