@@ -7,16 +7,17 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from loopcal.apply.compensation import compensate
 from loopcal.cli.entry_point import main
 from loopcal.errors import FileError, MechanismError
-from loopcal.estimate.identification import identify
+from loopcal.estimate.identification import identify, identify_trials
 from loopcal.estimate.penalties import MAP
 from loopcal.measure.instrument import Gaussian, Instrument, Sensor
 from loopcal.measure.kinds.poses import Pose
 from loopcal.measure.readings import select_joint_values
-from loopcal.measure.simulation import sample_truth, simulate
+from loopcal.measure.simulation import sample_truth, simulate, simulate_trials
 from loopcal.mechanism.kinematics import forward_trials
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import read_coordinates
@@ -396,3 +397,123 @@ def test_derivatives_of_loops_that_stay_open_between_gears(tmp_path, text, share
                     for s in (step, -step))  # fmt: skip
         slope = (up - down) / 2e-6
         assert np.abs(slope - sensed.parameters[0, ..., p]).max() < share * np.abs(slope).max()
+
+
+# --- couplings between the stages of a chain
+
+LEVEL_ARM = """format: 1
+family: stages
+name: level-arm
+units: {length: m, angle: rad}
+controlled: [x, z, pitch]
+couplings:
+  belts: {sum: {shoulder: 1, elbow.serial.joint: 0.5}, offset: 0.4, unknown: [offset, weight.elbow.serial.joint], angle: {sd: 0.003}, weights: {sd: 0.001}}
+stages:
+  - {name: shoulder, joint: {kind: R, axis: y, start: 0.5, errors: [offset], angle: {sd: 0.002}}}
+  - {name: elbow, mount: {x: 0.3}, joint: {kind: R, axis: y, drive: none, start: -0.2, errors: [x], length: {sd: 0.0002}}}
+  - {name: slide, mount: {x: 0.2}, joint: {kind: P, axis: x, start: 0.05}}
+  - {name: wrist, joint: {kind: R, axis: y, start: 0.1, tip: [0.08, 0, 0]}}
+workspace: {x: [0.4, 0.5], z: [-0.25, -0.15], pitch: [0, 0.5]}
+"""  # noqa: E501
+
+ROPE_TABLE = """format: 1
+family: stages
+name: rope-table
+units: {length: m, angle: rad}
+controlled: [x, y, z, roll, pitch, yaw]
+couplings:
+  rope: {of: length, sum: {q1: 1}, radius: {table.serial.joint: 0.25}, unknown: [offset, radius], length: {sd: 0.0002}, radii: {sd: 0.0005}}
+stages:
+  - {name: table, joint: {kind: R, axis: z, drive: none, tip: [0, 0, 0.02]}}
+  - name: legs
+    mount: {x: 0.03, yaw: 0.3}
+    family: gough
+    base: [[0.25, -0.02, 0], [0.25, 0.02, 0], [-0.107, 0.226, 0], [-0.142, 0.206, 0], [-0.142, -0.206, 0], [-0.107, -0.226, 0]]
+    platform: [[0.092, -0.119, 0], [0.092, 0.119, 0], [0.057, 0.139, 0], [-0.15, 0.02, 0], [-0.15, -0.02, 0], [0.057, -0.139, 0]]
+    lengths: 0.353
+    home: {z: 0.3}
+    tolerances: {base: {sd: 0.0002}, platform: {sd: 0.0002}, length: {sd: 0.0002}}
+workspace: {x: [0, 0.06], y: [-0.03, 0.03], z: [0.3, 0.34], roll: [-0.1, 0.1], pitch: [-0.1, 0.1], yaw: [0.25, 0.35]}
+"""  # noqa: E501
+
+
+def turn(axis: str, angle: Array) -> Array:
+    """Return poses (n, 4, 4) turned about an axis."""
+    T = np.tile(np.eye(4), (len(angle), 1, 1))
+    T[:, :3, :3] = Rotation.from_euler(axis, angle[:, None]).as_matrix()
+    return T
+
+
+def compare_level_arm(value: dict[str, float], q: Array, T: Array) -> Array:
+    """Return by how much poses (n, 4, 4) of LEVEL_ARM differ from those of its drawing."""
+    upper = q[:, 0] + value["shoulder.offset"]
+    fore = upper + (value["belts.offset"] - upper) / value["belts.weight.elbow.serial.joint"]
+    arms = [(0.3 + value["elbow.x"], upper), (0.2 + q[:, 1], fore), (0.08, fore + q[:, 2])]
+    end = turn("y", fore + q[:, 2])
+    end[:, 0, 3] = sum(length * np.cos(angle) for length, angle in arms)
+    end[:, 2, 3] = sum(-length * np.sin(angle) for length, angle in arms)
+    return T - end
+
+
+def compare_rope_table(value: dict[str, float], q: Array, T: Array) -> Array:
+    """Return by how much readings (n, 6) of ROPE_TABLE differ from the lengths of its legs."""
+    angle = (value["rope.offset"] - q[:, 0]) / value["rope.radius.table.serial.joint"]
+    mount = turn("z", np.array([0.3]))
+    mount[:, :3, 3] = [0.03, 0, 0.02]
+    own = np.linalg.inv(turn("z", angle) @ mount) @ T
+    base, top = (
+        np.array([[value[f"legs.leg{i}.{part}.{a}"] for a in "xyz"] for i in range(1, 7)])
+        for part in ("base", "platform")
+    )
+    gaps = own[:, None, :3, 3] + np.einsum("nij,kj->nki", own[:, :3, :3], top) - base
+    lengths = [value[f"legs.leg{i}.length"] for i in range(1, 7)]
+    return np.asarray(np.linalg.norm(gaps, axis=2) - lengths - q)
+
+
+CHAINS = {
+    "level-arm": (LEVEL_ARM, compare_level_arm),
+    "rope-table": (ROPE_TABLE, compare_rope_table),
+}
+
+
+@pytest.mark.parametrize("name", CHAINS)
+def test_stages_of_a_chain_are_coupled(tmp_path: Path, name: str) -> None:
+    """An arm whose belts turn its elbow, a hexapod that turns the table that carries it."""
+    text, compare = CHAINS[name]
+    nominal = load_text(tmp_path, text)
+    robot = nominal.with_values(sample_truth(nominal, 1, 1)[0])
+    reached = inverse(robot, sample_workspace(nominal, 100, seed=2).coordinates)
+    assert reached.converged.all()
+    value = dict(zip(robot.parameters.names, robot.values, strict=True))
+    assert np.abs(compare(value, reached.q, reached.T)).max() < 1e-9
+    there = forward(robot, reached.q)
+    assert there.converged.all()
+    assert_allclose(there.T, reached.T, rtol=0, atol=1e-9)
+    check_pose_derivatives(robot, there.q[None, :3])
+
+
+@pytest.mark.parametrize("name", CHAINS)
+def test_coupled_chains_are_as_accurate_as_stated(tmp_path: Path, name: str) -> None:
+    robot = load_text(tmp_path, CHAINS[name][0])
+    instrument = Instrument((Sensor(Pose("rotation-vector"), Gaussian(np.repeat(1e-5, 6))),))
+    poses, truth = sample_workspace(robot, 40, seed=1).coordinates, sample_truth(robot, 40, 2)
+    trials = simulate_trials(robot, truth, poses, instrument, 3)
+    fits = identify_trials(robot, trials, MAP())
+    assert fits.converged.all()
+    error = (fits.values - truth) / fits.standard_deviations()
+    assert (error**2).mean() == pytest.approx(1.0, abs=3 * np.sqrt(2 / error.size))
+
+
+def test_a_coupled_chain_refuses_what_it_cannot_be(tmp_path: Path) -> None:
+    for old, new, sentence in (
+        ("drive: none, start: -0.2, errors: [x]", "drive: none, errors: [gain]", "has no drive"),
+        ("elbow.serial.joint: 0.5", "elbow.joint: 0.5", "'elbow.joint', which is neither"),
+        ("of: length, sum", "of: length, condition: temperature, sum", "does not state"),
+        ("    family: gough\n", "    family: gough\n    tool: {z: 0.1}\n", "states a tool"),
+    ):
+        text = LEVEL_ARM if old in LEVEL_ARM else ROPE_TABLE
+        with pytest.raises((FileError, MechanismError), match=sentence):
+            load_text(tmp_path, text.replace(old, new))
+    plain = LEVEL_ARM[: LEVEL_ARM.index("couplings:")] + LEVEL_ARM[LEVEL_ARM.index("stages:\n") :]
+    with pytest.raises(FileError, match="stage 'elbow' has no actuators"):
+        load_text(tmp_path, plain)

@@ -347,9 +347,9 @@ def _place_bodies(record: Limbs, limbs: Sequence[Limb]) -> dict[str, FloatArray]
     names = [name for name, _ in homes]
     _check_ends(limbs, names)
     known = {BASE: np.eye(4)} | {name: T for name, T in homes if T is not None}
-    _follow_rigid_limbs(known, [limb for limb in limbs if PLATFORM not in (limb.on, limb.to)])
+    follow_rigid_limbs(known, [limb for limb in limbs if PLATFORM not in (limb.on, limb.to)])
     known[PLATFORM] = record.home.matrix  # less certain than what the base carries
-    _follow_rigid_limbs(known, limbs)
+    follow_rigid_limbs(known, limbs)
     missing = [name for name in names if name not in known]
     if missing:
         raise MechanismError(
@@ -359,7 +359,7 @@ def _place_bodies(record: Limbs, limbs: Sequence[Limb]) -> dict[str, FloatArray]
     return {name: known[name] for name in names}
 
 
-def _follow_rigid_limbs(known: dict[str, FloatArray], limbs: Sequence[Limb]) -> None:
+def follow_rigid_limbs(known: dict[str, FloatArray], limbs: Sequence[Limb]) -> None:
     """Add the poses of bodies that rigid limbs join to bodies of known poses."""
     count = 0
     while count < len(known):

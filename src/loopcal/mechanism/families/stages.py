@@ -19,11 +19,13 @@ from loopcal.mechanism.assembly import (
     AXES,
     BASE,
     FORCES,
+    PLATFORM,
     Actuator,
     Address,
     Assembly,
     AttachedStage,
     Joint,
+    Limb,
     LinearMap,
 )
 from loopcal.mechanism.families.drives import (
@@ -31,9 +33,19 @@ from loopcal.mechanism.families.drives import (
     LoadFrame,
     NamedTriangleDrive,
     StrokeError,
+    list_conditions,
+    place_rows,
     refuse_idle_drives,
+    row_errors,
 )
-from loopcal.mechanism.families.limbs import ORIGIN, Axis, Place, axis_vector, matrix_from_place
+from loopcal.mechanism.families.limbs import (
+    ORIGIN,
+    Axis,
+    Place,
+    axis_vector,
+    follow_rigid_limbs,
+    matrix_from_place,
+)
 from loopcal.mechanism.families.placement import (
     AngleTolerance,
     ErrorModel,
@@ -55,6 +67,7 @@ from loopcal.mechanism.families.placement import (
     strip_number,
 )
 from loopcal.mechanism.families.records import RobotRecord
+from loopcal.typing import FloatArray
 from loopcal.units import Dimension, Given, Ratio
 
 # The assembly of a chain: those of its stages, with the stage before each name.
@@ -102,7 +115,7 @@ def check_stage_names(names: Sequence[str], parents: Sequence[str | None]) -> li
 
 def join_stages(record: Stages, stages: Sequence[AttachedStage]) -> Assembly:
     """Return the assembly of a chain; its home is found when it is compiled."""
-    _refuse_wrong_drives(stages)
+    _refuse_wrong_drives(stages, is_coupled=bool(record.couplings))
     parts = [_add_prefix(stage.name, stage.assembly) for stage in stages]
     joined: dict[str, Any] = {
         name: tuple(item for part in parts for item in getattr(part, name))
@@ -123,6 +136,58 @@ def join_stages(record: Stages, stages: Sequence[AttachedStage]) -> Assembly:
         held=record.held,
         **joined,
     )
+
+
+def couple_stages(record: Stages, chain: Assembly) -> Assembly:
+    """Return the assembly of a chain with couplings between its stages as one of limbs, whose
+    bodies are the platforms of its stages; raises StageError for one with fewer than six freedoms.
+    """
+    known, limbs, rest = {BASE: np.eye(4)}, list[Limb](), list(chain.limbs)
+    for i, stage in enumerate(chain.stages):
+        own, is_last = stage.assembly, i + 1 == len(chain.stages)
+        if len(own.freedoms) < len(AXES):
+            raise StageError(
+                f"stage {stage.name!r} has the freedoms {', '.join(own.freedoms)}. In a chain with "
+                "couplings, let it have all six and limbs that hold the others",
+                i,
+            )
+        names = {body: f"{stage.name}.{body}" for body in own.bodies}
+        names |= {BASE: stage.on, PLATFORM: PLATFORM if is_last else stage.name}
+        moved = [_mount_limb(limb, names, stage.mount) for limb in rest[: len(own.limbs)]]
+        if own.controlled:
+            base = known[stage.on] @ stage.mount
+            homes = {**own.bodies, PLATFORM: own.home}
+            known |= {names[body]: base @ home for body, home in homes.items()}
+        follow_rigid_limbs(known, moved)
+        limbs, rest = limbs + moved, rest[len(own.limbs) :]
+    conditions = {name: of for name, of in record.conditions.items() if name not in FORCES}
+    placed = [
+        PlacedLimb(limb, {j.name: np.eye(3) for j in limb.joints}, {}, limb.name) for limb in limbs
+    ]
+    placed, _, rows = place_rows(placed, {}, (), record.couplings, conditions)
+    errors = join_errors(map(row_errors, rows.values()))
+    return replace(
+        chain,
+        limbs=tuple(limb.limb for limb in placed),
+        actuators=(*chain.actuators, *list_conditions(conditions)),
+        home=known.pop(PLATFORM),
+        parameters=chain.parameters + errors.parameters,
+        maps=chain.maps + errors.maps,
+        stages=(),
+        bodies={name: T for name, T in known.items() if name != BASE},
+        couplings=(*chain.couplings, *(row.actuator for row in rows.values())),
+    )
+
+
+def _mount_limb(limb: Limb, names: Mapping[str, str], mount: FloatArray) -> Limb:
+    """Return a limb of a stage between bodies of a chain; names : body of the stage -> of it."""
+    links = limb.links, (limb.attachment,)
+    (first, *others), (last,) = (
+        [replace(own[0], transform=mount @ own[0].transform), *own[1:]] if end == BASE else own
+        for own, end in zip(links, (limb.on, limb.to), strict=True)
+    )
+    ends = {"on": names[limb.on], "to": names[limb.to]}
+    return replace(limb, links=(first, *others), attachment=last, **ends)
 
 
 def _add_prefix(stage: str, part: Assembly) -> Assembly:
@@ -158,11 +223,13 @@ def _add_prefix(stage: str, part: Assembly) -> Assembly:
     )
 
 
-def _refuse_wrong_drives(stages: Sequence[AttachedStage]) -> None:
-    """Raise StageError for a stage without actuators, and for an actuator of two stages."""
+def _refuse_wrong_drives(stages: Sequence[AttachedStage], is_coupled: bool) -> None:
+    """Raise StageError for a stage without actuators, unless couplings move it, and for an actuator
+    of two stages.
+    """
     owner: dict[str, str] = {}
     for i, stage in enumerate(stages):
-        if not stage.assembly.actuators:
+        if not (stage.assembly.actuators or is_coupled):
             raise StageError(
                 f"stage {stage.name!r} has no actuators. Name the drive of one of its joints, or "
                 "make it part of the mount of the next stage",
@@ -181,8 +248,8 @@ def _refuse_wrong_drives(stages: Sequence[AttachedStage]) -> None:
 
 
 JointError = Literal[Freedom, "offset", "gain"]
-LIMB, LINK = "serial", "joint"
-"""Names of the limb and of the joint of a serial stage."""
+LIMB, LINK, PASSIVE = "serial", "joint", "none"
+"""Names of the limb and of the joint of a serial stage, and of no drive."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -223,8 +290,9 @@ class SerialRotation(SerialJoint):
 
     Attributes
     ----------
-    drive : name of its actuator (default: of the stage). Or a linear actuator that turns
-        it, `{triangle: ..}`, which states its own stroke, gain, sigma and unknowns.
+    drive : name of its actuator (default: of the stage), or `none` of a joint that couplings move.
+        Or a linear actuator that turns it, `{triangle: ..}`, which states its own stroke, gain,
+        sigma and unknowns.
     """
 
     GIVEN: ClassVar[Dimension] = Dimension.ANGLE
@@ -239,7 +307,7 @@ class SerialSlide(SerialJoint):
 
     Attributes
     ----------
-    drive : name of its actuator (default: of the stage).
+    drive : name of its actuator (default: of the stage), or `none` of a joint that couplings move.
     """
 
     kind: Literal["P"]
@@ -300,11 +368,8 @@ class PlacedStages(Stages):
 
     def expand(self) -> Assembly:
         """Return the assembly of all stages; raises StageError where they do not fit together."""
-        own_rows = "Describe these stages as one robot of family limbs, with `couplings:`"
         for key, is_stated, remedy in (
             ("parameters", bool(self.parameters), "Give them in a stage that has a `family:`"),
-            ("couplings", bool(self.couplings), own_rows),
-            ("conditions", any(name not in FORCES for name in self.conditions), own_rows),
             ("home", self.home != PoseRecord(), "Give `start:` of a joint or `home:` of a stage"),
         ):
             if is_stated:
@@ -325,7 +390,9 @@ class PlacedStages(Stages):
         )
         actuators = [a.name for stage in attached for a in stage.assembly.actuators]
         refuse_idle_drives(self.drives, actuators, map(strip_number, actuators))
-        return join_stages(self, attached)
+        chain = join_stages(self, attached)
+        is_coupled = self.couplings or any(name not in FORCES for name in self.conditions)
+        return couple_stages(self, chain) if is_coupled else chain
 
     def _expand_stage(self, i: int) -> Assembly:
         """Return the assembly of a stage alone."""
@@ -373,7 +440,10 @@ def expand_joint(
     assert isinstance(drive, str)
     if triangle is not None:
         _refuse_terms_beside_triangle(record, drive)
-    joint = Joint(LINK, record.kind, drive, start=record.gain * record.start)
+    is_passive = record.drive == PASSIVE
+    joint = Joint(
+        LINK, record.kind, None if is_passive else drive, start=record.gain * record.start
+    )
     step = JointPlacement(joint, matrix_from_place(record.at), axis_vector(record.axis))
     limb = place_limb(LIMB, (step,), matrix_from_place(record.tip), "rigid", np.eye(4))
     own = Actuator(drive, record.GIVEN, record.stroke, {"gain": record.gain}, sigma=record.sigma)
@@ -384,6 +454,8 @@ def expand_joint(
             "drives",
             drive,
         )
+    if is_passive and not {"offset", "gain"}.isdisjoint(record.errors):
+        raise MechanismError(f"the joint has no drive, and so no {' or '.join(record.errors)}")
     robot = RobotRecord(name, drives={drive: triangle} if triangle else stated)
     errors = join_errors(_joint_error(record, limb, drive, error) for error in record.errors)
     of_platform = join_errors(
