@@ -125,10 +125,17 @@ def _format_nested(record: type) -> str:
 def format_kinds() -> str:
     """Return columns and settings of every kind of measurement, common settings once."""
     meanings = {name: _collect_settings(kind) for name, kind in KINDS.items()}
-    counts = Counter(setting for settings in meanings.values() for setting in settings.items())
-    common = {setting: None for setting, count in counts.items() if count > 1}
+    users: dict[tuple[str, str], list[str]] = {}
+    for name, settings in meanings.items():
+        for setting in settings.items():
+            users.setdefault(setting, []).append(f"`{name}`")
+    common = {setting: kinds for setting, kinds in users.items() if len(kinds) > 1}
+    several = Counter(key for key, _ in common)
     header = ("setting", "meaning")
-    rows = [(f"`{key}`", words) for key, words in common]
+    rows = [
+        (f"`{key}`" + (several[key] > 1) * f" of {', '.join(kinds)}", words)
+        for (key, words), kinds in common.items()
+    ]
     sections = [f"### Settings of several kinds\n\n{format_table(header, rows)}"]
     for name, kind in KINDS.items():
         examples = dict.fromkeys(_describe_example(example) for example in kind.examples())
@@ -136,8 +143,10 @@ def format_kinds() -> str:
         if any(map(any, examples)):
             parts += [format_table(("settings", "columns", "noise of"), examples)]
         shared = [f"`{key}`" for key, words in meanings[name].items() if (key, words) in common]
-        if shared:
-            parts += [f"Common settings: {', '.join(shared)}.\n"]
+        items = ", ".join(f"`{item}`" for item in kind.allowed_unknown)
+        said = [f"Common settings: {', '.join(shared)}."] * bool(shared)
+        said += [f"`unknown` can list {items}."] * ("," in items)
+        parts += [" ".join(said) + "\n"] * bool(said)
         own = merge_rows((f"`{k}`", w) for k, w in meanings[name].items() if (k, w) not in common)
         sections.append("\n".join([*parts, *([format_table(header, own)] if own else [])]))
     return "\n".join(sections)
@@ -146,9 +155,10 @@ def format_kinds() -> str:
 def _collect_settings(kind: type[Kind]) -> dict[str, str]:
     """Return the meaning of each setting of a kind."""
     meanings = file_reference.collect_meanings(kind)
-    if len(possible := kind.allowed_unknown) > 1:
-        meanings["unknown"] = f"Which of {', '.join(f'`{p}`' for p in possible)} the fit estimates"
-    return {key: _word(meanings.get(key, "")) for key in list_kind_settings(kind)}
+    settings = {key: _word(meanings.get(key, "")) for key in list_kind_settings(kind)}
+    if len(kind.allowed_unknown) > 1:
+        settings.pop("unknown", None)  # a line of its own
+    return settings
 
 
 def _word(meaning: str) -> str:

@@ -44,8 +44,8 @@ class ToolKind(Kind):
 
     Parameters
     ----------
-    T_base_frame : (4, 4), instrument frame in the base; default: the base itself. If the frame is
-        unknown, this is its nominal value.
+    T_base_frame : (4, 4), frame of the instrument in the base; default: the base itself. If it is
+        unknown, its nominal value.
     T_platform_tool : (4, 4), tool on the platform; default: the tool of the robot.
     unknown : which of "frame" and "tool" are unknown, six numbers each. One value holds for a
         session.

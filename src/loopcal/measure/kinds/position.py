@@ -59,7 +59,8 @@ class TargetKind(Kind):
         and so on.
     places : (k, 3) [m], targets on the platform; default: the origin of the robot's tool. If the
         targets are unknown, these are their nominal values.
-    T_base_frame : (4, 4), frame of the instrument in the base; default: the base itself.
+    T_base_frame : (4, 4), frame of the instrument in the base; default: the base itself. If it is
+        unknown, its nominal value.
     unknown : which of `allowed_unknown` are unknown. One value holds for a session (of a surface:
         for a group of rows).
     frame : name of the frame. Kinds that use the same name share its parameters.
