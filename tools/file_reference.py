@@ -138,7 +138,10 @@ def format_kinds() -> str:
     ]
     sections = [f"### Settings of several kinds\n\n{format_table(header, rows)}"]
     for name, kind in KINDS.items():
-        examples = dict.fromkeys(_describe_example(example) for example in kind.examples())
+        shown: dict[tuple[str, ...], tuple[str, str, str]] = {}  # of equal columns the first
+        for example in map(_describe_example, kind.examples()):
+            shown.setdefault(example[1:], example)
+        examples = list(shown.values())
         parts = [f"### `kind: {name}`\n\n{summarize(kind)}\n"]
         if any(map(any, examples)):
             parts += [format_table(("settings", "columns", "noise of"), examples)]

@@ -385,7 +385,9 @@ def load_stored_values(path: str | Path, robot: Mechanism) -> dict[str, float] |
 
 # Reference of file keys, taken from the records that read them: types, defaults, docstrings.
 
-SECTION = re.compile(r"^(Attributes|Examples|Parameters|Raises|Returns)\n-{3,}\n", re.MULTILINE)
+SECTION = re.compile(
+    r"^(Attributes|Examples|Notes|Parameters|Raises|Returns)\n-{3,}\n", re.MULTILINE
+)
 SHORT = re.compile(r"(?:^ *|(?<=[.;] ))((?:\w+, )*\w+) :\s", re.MULTILINE)
 SI = re.compile(r" \[(?:m|rad|m per turn|m, rad|m or rad)\]")
 ELSEWHERE = re.compile(r"(?:Others: )?[Ss]ee (?:`\w+`|the module)(?:, |; |\. ?|$)")

@@ -133,9 +133,6 @@ class Pose(ToolKind):
     """Position and orientation of the tool, in axes of the frame.
 
     Residual: `(log(R_predicted R_measured'), t_predicted - t_measured)`.
-    With r the rotation part, Q the rotation from base to frame and a the arm from platform origin
-    to tool: `d r = J_left^-1(r) Q omega` and `d t = Q (v + omega x a)`.
-
     Setup parameters: `frame.rx` to `frame.rz` [rad], `frame.x` to `frame.z` [m]; likewise
     `tool.rx` to `tool.z`.
 
@@ -150,6 +147,11 @@ class Pose(ToolKind):
     Raises
     ------
     DataError : the orientation form does not exist or a frame is not a pose.
+
+    Notes
+    -----
+    With r the rotation part, Q the rotation from base to frame and a the arm from platform origin
+    to tool: `d r = J_left^-1(r) Q omega` and `d t = Q (v + omega x a)`.
 
     Examples
     --------
@@ -311,11 +313,8 @@ class Component(ToolKind):
     """Some coordinates of the tool. z alone is a probed height. Residual: `predicted - measured` of
     each, angles wrapped into (-pi, pi].
 
-    With E the rates of the declared angles, Q the rotation from base to frame and a the arm from
-    platform origin to tool: `d(angles) = E^-1 Q omega` and `d t = Q (v + omega x a)`. Where the
-    measured tilt is below 0.05 rad, the residuals of theta and phi are the differences of the
-    normal's x and y [rad], with `d n = (Q omega) x n`; a sigma stated for theta and phi applies to
-    these differences.
+    Below a measured tilt of 0.05 rad, the residuals of theta and phi are the differences of the
+    normal's x and y [rad]. The sigma of theta and phi applies to these differences.
 
     Setup parameters: those of `Pose`.
 
@@ -331,6 +330,12 @@ class Component(ToolKind):
     ------
     DataError : a component does not exist or is named twice, if angles have no declared
         orientation, or if phi is measured without theta.
+
+    Notes
+    -----
+    With E the rates of the declared angles, Q the rotation from base to frame and a the arm from
+    platform origin to tool: `d(angles) = E^-1 Q omega`, `d t = Q (v + omega x a)`, and of the
+    normal `d n = (Q omega) x n`.
 
     Examples
     --------
