@@ -39,7 +39,9 @@ NEAREST = 1e-3
 """Share of the distance from the camera below which the depth of a point is not taken, so that a
 point beside or behind the camera has a large, finite residual that leads back."""
 FEWEST = 4  # points of a picture that determine the pose of a board
-LEVEL = 1e-5  # tilt of boards, as a share of squared slopes, below which they count as level
+# Tilt of boards, as a share of squared slopes, and squared slope of the sight to a corner of the
+# picture, below which they count as level.
+LEVEL = 1e-5
 STEPS, HALVINGS, CHANGE = 40, 6, 1e-8  # of the descent; a relative change that ends it
 FEW_STEPS = 10  # of the descent to the pose of a board from a closed form
 ROUNDING = 1e-12  # relative increase of a sum of squares that is none
@@ -165,7 +167,7 @@ def solve_focal_lengths(
     for columns in (both[:, :2], both[:, :2].sum(axis=1, keepdims=True)):  # else fx = fy
         weights, _, rank, s = np.linalg.lstsq(columns, -both[:, 2], rcond=None)
         is_determined = rank == columns.shape[1] and s[-1] > max(1e-4 * s[0], LEVEL * scale)
-        if is_determined and (weights > 0.0).all():
+        if is_determined and (weights * (center @ center) > LEVEL).all():
             focal = 1.0 / np.sqrt(weights)
             return np.broadcast_to(focal, 2).copy()
     return None
