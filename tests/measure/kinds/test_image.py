@@ -84,7 +84,7 @@ def test_focal_lengths_follow_in_closed_form_without_distortion() -> None:
     focal = solve_focal_lengths(BOARD, pixels, lens[2:4])
     assert focal is not None
     np.testing.assert_allclose(focal, lens[:2], rtol=1e-8)
-    for place in np.random.default_rng(1).uniform(-0.1, 0.1, (20, 3)) + [0.0, 0.0, 0.5]:
+    for place in np.random.default_rng(1).uniform([-0.1, -0.1, 0.4], [0.1, 0.1, 0.6], (20, 3)):
         level = np.tile(geometry.make_pose(np.eye(3), place), (4, 1, 1))
         x = (level[:, None, :3, :3] @ BOARD[..., None])[..., 0] + level[:, None, :3, 3]
         assert solve_focal_lengths(BOARD, project(x, lens)[0], lens[2:4]) is None
