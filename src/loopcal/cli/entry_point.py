@@ -199,7 +199,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 has_folder = Path.cwd().is_dir()
             if command is not None and not has_folder:
                 sentence = "the working folder has disappeared. Change to a folder that exists."
-                return _refuse(sentence, words)
+                return _refuse(sentence, words, FileNotFoundError())
             code = command_line.main(words, "loopcal", standalone_mode=False, obj=words)
             terminal.flush_output()
             return code if isinstance(code, int) else 0
@@ -251,9 +251,9 @@ def _report(
         case MemoryError():
             sentence = "there is not enough memory for this. Use fewer poses at a time."
         case _:
-            _refuse(describe_defect(error, words), words)
+            _refuse(describe_defect(error, words), words, error)
             return 3
-    return _refuse(sentence, words, hint, getattr(error, "code", None))
+    return _refuse(sentence, words, error, hint)
 
 
 def _name_inputs(
@@ -277,7 +277,7 @@ def _name_inputs(
 
 
 def _refuse(
-    sentence: str, words: Sequence[str], hint: str | None = None, code: str | None = None
+    sentence: str, words: Sequence[str], error: BaseException, hint: str | None = None
 ) -> int:
     """Print a sentence, and a hint where there is one, on standard error; return exit code 1.
 
@@ -291,7 +291,9 @@ def _refuse(
         from loopcal.io.core.text_file import to_json
 
         with suppress(LoopcalError, BrokenPipeError):  # the sentence above is said all the same
-            terminal.print_text(to_json({"error": {"code": code, "text": sentence, "hint": hint}}))
+            stated = {"type": type(error).__name__, "code": getattr(error, "code", None)}
+            stated |= {"text": sentence, "hint": hint}
+            terminal.print_text(to_json({"format": terminal.FORMAT, "error": stated}))
     return 1
 
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import codecs
+import json
 import os
 import shutil
 import sys
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from loopcal.findings import Finding
     from loopcal.results.tables import Block
 
+FORMAT = 1  # of the documents that --json prints and no file holds: output.schema.json
 WIDEST = 120  # characters of the longest line of prose, on wide terminals
 LONGEST_MESSAGE = 4000  # characters of a message; a longer one lists more than anybody reads
 DELAY = 2.0  # seconds of work before progress is shown
@@ -56,10 +58,12 @@ class Output:
 def print_output(output: Output, as_json: bool) -> int:
     """Print what a command has found out, and return its exit code."""
     page = None if as_json else output.page()
-    if as_json and output.document is not None:
-        from loopcal.io.core.text_file import to_json
+    if as_json:
+        from loopcal.io.core.text_file import convert_document, to_json
 
-        print_text(to_json(add_findings(output.document)))
+        content = convert_document(output.document)
+        number = {} if "$schema" in content else {"format": FORMAT}
+        print_text(to_json(add_findings(number | content)))
     elif isinstance(page, str):
         print_text(page)
     elif page:
@@ -71,6 +75,11 @@ def print_output(output: Output, as_json: bool) -> int:
         for failure in failures:
             print_message(f"loopcal: quality gate not met: {failure}")
     return (2 if failures else 0) if output.exit_code is None else output.exit_code
+
+
+def read_output_schema() -> dict[str, Any]:
+    """Return the JSON Schema of the documents of all commands, which tools.output_schema makes."""
+    return json.loads(Path(__file__).with_name("output.schema.json").read_text("utf-8"))
 
 
 def print_text(text: str) -> None:

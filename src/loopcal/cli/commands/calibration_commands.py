@@ -358,7 +358,7 @@ def compensate(
     refuse_outputs((output,), inputs, force)
     failure = find_failure(run)
     if failure is not None and not force:
-        return Output(None, list, [with_hint(failure)])
+        return Output({"reasons": [failure]}, list, [with_hint(failure)])
     source = load_run_or_robot(run)
     known = source.load_posterior() if run.is_dir() else source.robot
     robot = known if isinstance(known, lc.Mechanism) else known.robot

@@ -23,12 +23,13 @@ from loopcal.units import Dimension, find_unit, list_symbols
 if TYPE_CHECKING:
     from loopcal.results.tables import Block
 
-# Kind of file -> what makes its JSON Schema.
+# Kind of file, or output of all commands -> what makes its JSON Schema.
 SCHEMAS = {
     "robot": "loopcal.io.file_schemas:build_robot_schema",
     "settings": "loopcal.io.file_schemas:build_settings_schema",
     "profile": "loopcal.io.file_schemas:build_profile_schema",
     "study": "loopcal.studies.files.study_file:build_study_schema",
+    "output": "loopcal.cli.terminal:read_output_schema",
 }
 
 
@@ -106,7 +107,7 @@ def schema(
     force: bool = opt.force("the file"),
 ) -> Output:
     """Print the JSON Schema of a kind of file: robot, settings (of a measurement file), profile or
-    study.
+    study. Of output: of the documents that commands print with --json.
 
     An editor with the schema completes keys, shows their meaning and marks mistakes. The first line
     of a file from `loopcal new` names it.
@@ -698,7 +699,7 @@ def export(
     failure = find_failure(source)
     failures = [] if failure is None else [failure]
     if failures and not force:
-        document = {"output": None, "format": target.name, "notes": [], "reasons": failures}
+        document = {"output": None, "written_as": target.name, "notes": [], "reasons": failures}
         return Output(document, list, [with_hint(failure) for failure in failures])
     run = load_run_or_robot(source)
     old = run.initial_robot if controller is None else lc.load_robot(controller)
@@ -729,7 +730,7 @@ def export(
     for file, text in written.items():
         write_text(file, text)
     notes = [str(finding) for finding in exported.findings]
-    document = {"output": output, "format": target.name, "notes": notes, "reasons": failures}
+    document = {"output": output, "written_as": target.name, "notes": notes, "reasons": failures}
     document |= {"text": exported.text} if output is None else {}
 
     def view() -> list[str] | str:
