@@ -174,13 +174,7 @@ def transport_to_end(robot: Mechanism, state: State, end: int) -> list[tuple[int
     `end`.
     """
     assert isinstance(state, ChainState)
-    return transport_twists(robot, *locate_stage_bases(robot.stages, state.poses), end)
-
-
-def transport_twists(
-    robot: Mechanism, bases: Sequence[FloatArray], platforms: Sequence[FloatArray], end: int
-) -> list[tuple[int, FloatArray]]:
-    """Return what `transport_to_end` returns, for bases and platforms of `locate_stage_bases`."""
+    bases, platforms = locate_stage_bases(robot.stages, state.poses)
     transports = []
     for i in list_carrying_stages(robot, end):
         rotation = bases[i][..., :3, :3]

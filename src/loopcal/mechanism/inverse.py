@@ -10,7 +10,7 @@ docs/theory/kinematics.md.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,9 +22,9 @@ from loopcal.mechanism.chains import (
     find_carrying_actuators,
     has_spare_drives,
     join_stage_states,
+    list_carrying_stages,
     locate_stage_bases,
     split_stage_states,
-    transport_twists,
 )
 from loopcal.mechanism.kinematics import Loops, compute_closure_sign, solve_serial
 from loopcal.mechanism.limb_rows import move_serial, place_serial
@@ -204,13 +204,13 @@ class _Rows:
         stage displacements, links and pitches of `place_serial` without loops, open sums, and
         transmissions, (1 | R, ..).
     sign : (R,) of det(C D) at the start. moving : drives that carry the end platform.
-    units : (u,) lengths that a unit of each drive counts for: the robot's size for an angle.
+    turns : (u,) whether each drive turns joints, so that its unit counts for the robot's size.
     spans : (u,) strokes of the drives, of which steps take equal shares with more drives than
         coordinates; a full turn or the size without a stroke, and where the step is unique.
     poses : (R, 4, 4) in place of coordinates, of which the nearest ones are searched for.
     """
 
-    shared: ClassVar[tuple[str, ...]] = ("robot", "units", "spans", "moving")
+    shared: ClassVar[tuple[str, ...]] = ("robot", "turns", "spans", "moving")
 
     robot: Mechanism
     values: FloatArray
@@ -220,7 +220,7 @@ class _Rows:
     sums: tuple[OpenSums | None, ...]
     terms: tuple[FloatArray, ...]
     sign: FloatArray
-    units: FloatArray
+    turns: BoolArray
     spans: FloatArray
     moving: IntArray
     poses: FloatArray | None = None
@@ -233,7 +233,7 @@ class _Rows:
 
     def evaluate(self, u: FloatArray, begin: tuple[State, ...]) -> _Iterate:
         """Return the iterate at driven joints u (R, u); its gap is infinite for an open loop."""
-        stages, states, moved = self.robot.blocks, list[State](), list[tuple[FloatArray, ...]]()
+        stages, states, moved = self.robot.blocks, list[State](), list[tuple[FloatArray, Any]]()
         ok, loops = np.isfinite(u).all(axis=1), iter(begin)
         with np.errstate(invalid="ignore"):
             for stage, e, links, sums in zip(stages, self.e, self.links, self.sums, strict=True):
@@ -249,14 +249,29 @@ class _Rows:
                 states.append(state)
                 ok &= state.status[:, 0] == CONVERGED
             bases, platforms = locate_stage_bases(stages, [T for T, _ in moved])
-            D = np.zeros((len(u), 6, u.shape[1]))
-            for i, transport in transport_twists(self.robot, bases, platforms, -1):
-                first, by_drive = stages[i].actuators.start, moved[i][1]
-                D[..., first : first + by_drive.shape[2]] = transport @ by_drive
+            D, T = np.zeros((len(u), 6, u.shape[1])), platforms[-1]
+            # frames and advances of joints in serial stages, zero for others
+            joints, advance = np.zeros((*u.shape, 4, 4)), np.zeros(u.shape)
+            for i in list_carrying_stages(self.robot):
+                (_, by_drive), links, drives = moved[i], self.links[i], stages[i].actuators
+                if links is not None:
+                    for column, frame in enumerate(by_drive, drives.start):
+                        joints[:, column] = bases[i] @ frame
+                    advance[:, drives] = links[1]
+                    continue
+                vectors = by_drive.reshape(len(by_drive), 2, 3, -1)
+                turned, shifted = np.moveaxis(bases[i][..., None, :3, :3] @ vectors, 1, 0)
+                shifted = shifted - geometry.hat(T[..., :3, 3] - platforms[i][..., :3, 3]) @ turned
+                place = slice(drives.start, drives.start + by_drive.shape[2])
+                D[..., place] = np.concatenate([turned, shifted], axis=1)
+            axes, arms = joints[..., :3, 2], T[..., None, :3, 3] - joints[..., :3, 3]
+            turning = axes * self.turns[:, None]
+            moving = advance[..., None] * axes + np.cross(turning, arms)
+            D += np.concatenate([turning, moving], axis=2).swapaxes(1, 2)
         D[~ok] = np.nan
         none = np.zeros(len(u))
         status, zero = none.astype(np.int8), np.zeros_like(u)
-        T = np.broadcast_to(platforms[-1], (len(u), 4, 4))
+        T = np.broadcast_to(T, (len(u), 4, 4))
         parts = tuple(states), T, D, none, none, zero, none, status, none.astype(int)
         return self.aim(_Iterate(u, *parts))
 
@@ -367,7 +382,8 @@ class _Rows:
 
     def limit_steps(self, step: FloatArray) -> FloatArray:
         """Return steps (R, u) that move no joint farther than the longest step."""
-        length = np.abs(step * self.units).max(axis=1, initial=0.0) / self.robot.size
+        moved = np.abs(step) / np.where(self.turns, 1.0, self.robot.size)
+        length = moved.max(axis=1, initial=0.0)
         return step * (LONGEST_STEP / np.maximum(length, LONGEST_STEP))[:, None]
 
     def join_states(self, now: _Iterate) -> State:
@@ -454,7 +470,7 @@ def _make_rows(robot: Mechanism, values: FloatArray, target: FloatArray) -> _Row
         sums,
         tuple(tau for _, tau in slots),
         np.zeros(len(target)),
-        np.where(turns, robot.size, 1.0),
+        np.array(turns),
         measure_spans(robot, np.array(turns)),
         find_carrying_actuators(robot),
     )

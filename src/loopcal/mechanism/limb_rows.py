@@ -232,34 +232,28 @@ def follow_limb(
 
 def place_serial(group: Group, displacements: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the links (t, J + 1, 4, 4) of a limb whose joints are all driven, the platform behind
-    the last one, and the pitches (t, J), for displacements (t, s).
+    the last one, and the advances (t, J) of its joints, 1 for a slide, for displacements (t, s).
     """
     links, pitch = place_links(group, 0, displacements)
     last = links[:, -2] @ geometry.invert_pose(links[:, -1])
-    return np.concatenate([links[:, :-2], last[:, None]], axis=1), pitch
+    slides = np.array([letter == "P" for letter in group.joints])
+    return np.concatenate([links[:, :-2], last[:, None]], axis=1), np.where(slides, 1.0, pitch)
 
 
 def move_serial(
-    group: Group, links: FloatArray, pitch: FloatArray, values: FloatArray
-) -> tuple[FloatArray, FloatArray]:
+    group: Group, links: FloatArray, advance: FloatArray, values: FloatArray
+) -> tuple[FloatArray, list[FloatArray]]:
     """Return the platforms (R, 4, 4) [m] of a limb whose joints are all driven, in its base, and
-    their twists (R, 6, a) by the values (R, a) of its drives.
+    the frames (R, 4, 4) of its joints, for the values (R, a) of its drives.
 
-    links, pitch : (1 | R, ..) of `place_serial`.
+    links, advance : (1 | R, ..) of `place_serial`.
     """
-    drives, before, T = group.actuator[:, 0], list[FloatArray](), links[:, 0]
+    frames, T = list[FloatArray](), links[:, 0]
     for j, letter in enumerate(group.joints):
-        before.append(T)
-        T = T @ move_joint(letter, values[:, drives[j]], pitch[:, j]) @ links[:, j + 1]
-    D = np.zeros((len(values), 6, values.shape[1]))
-    for j, (letter, frame) in enumerate(zip(group.joints, before, strict=True)):
-        axis = frame[:, :3, 2]
-        D[:, 3:, drives[j]] = axis if letter == "P" else pitch[:, j, None] * axis
-        if letter == "R":
-            arm = T[:, :3, 3] - frame[:, :3, 3]
-            D[:, :3, drives[j]] = axis
-            D[:, 3:, drives[j]] += np.matmul(geometry.hat(axis), arm[..., None])[..., 0]
-    return T, D
+        frames.append(T)
+        motion = move_joint(letter, values[:, group.actuator[j, 0]], advance[:, j])
+        T = T @ motion @ links[:, j + 1]
+    return T, frames
 
 
 def place_links(group: Group, k: int, displacements: FloatArray) -> tuple[FloatArray, FloatArray]:
