@@ -23,14 +23,13 @@ from loopcal.measure.kinds import KINDS
 from loopcal.registry import _list_entry_points
 from loopcal.typing import FloatArray
 
+MODE = re.MULTILINE | re.DOTALL
 PAGE = Path(__file__).parents[1] / "docs" / "extending.md"
 
 
 def find_block(language: str) -> str:
     """Return the block of the page in a language."""
-    (block,) = re.findall(
-        rf"^```{language}\n(.*?)^```$", PAGE.read_text(), re.MULTILINE | re.DOTALL
-    )
+    (block,) = re.findall(rf"^```{language}\n(.*?)^```$", PAGE.read_text(), MODE)
     return block
 
 
@@ -72,13 +71,21 @@ def package(registered, tmp_path, monkeypatch) -> Path:
     return tmp_path
 
 
+@pytest.mark.slow
 def test_the_commands_of_the_page_use_an_installed_package(package, monkeypatch, capsys) -> None:
     monkeypatch.chdir(package)
     Path("printer.acme").write_text("RADIUS 105\nARM 220\n")
+    for name, text in re.findall(
+        r"<!-- file: (\S+) -->\n```yaml\n(.*?)^```$", PAGE.read_text(), MODE
+    ):
+        Path(name).write_text(text)
     for line in find_block("sh").splitlines():
         words = shlex.split(line)
         assert main(words[1:]) == 0, (line, capsys.readouterr())
     assert "runout" in Path("data.csv").read_text()
+    cells = json.loads(Path("results/summary.json").read_text())["cells"]
+    assert {cell["levels"]["instrument"] for cell in cells} == {"both", "tracker"}
+    assert len(cells) == 4
     result = json.loads(Path("run/result.json").read_text())
     assert result["options"]["fit"]["loss"] == "cauchy"
     radius, _ = Path("calibrated.acme").read_text().split()[1::2]

@@ -348,8 +348,8 @@ def _check_freedoms(assembly: Assembly, is_stage: bool) -> None:
         return
     if not assembly.controlled:
         raise MechanismError(
-            f"{assembly.name} names no controlled coordinate. Give one for each freedom, of "
-            f"{', '.join(COORDINATES)}"
+            f"{assembly.name} names no controlled coordinate. Give one for each freedom under "
+            f"controlled:, of {', '.join(COORDINATES)}"
         )
     check_coordinates(assembly.controlled)
 

@@ -414,9 +414,8 @@ FREEDOMS = {
     "controlled left out": (
         ("controlled: [x, y]\n", ""),
         (
-            "five-bar names no controlled coordinate. Give one for each freedom, of x, y, z, "
-            "roll, "
-            "pitch, yaw, phi, theta, psi"
+            "five-bar names no controlled coordinate. Give one for each freedom under controlled:, "
+            "of x, y, z, roll, pitch, yaw, phi, theta, psi"
         ),
     ),
     "controlled empty": (
