@@ -11,6 +11,7 @@ import pytest
 from loopcal.apply.calibration import calibrate
 from loopcal.apply.calibration_options import CalibrationOptions
 from loopcal.diagnose.cross_validation import (
+    Candidate,
     choose_model,
     cross_validate,
     draw_folds,
@@ -151,3 +152,8 @@ def test_parameters_are_not_chosen_by_rows_that_are_far_off():
     wrong = shift_pose(data, 4, [0.0] * 3 + [1000.0] * 3)
     with pytest.raises(DataError, match=r"Pose 5 is far off the others and alone would decide"):
         calibrate(hexapod(), wrong, CalibrationOptions(choose_model=True))
+
+
+def test_a_standard_error_is_not_called_plus_minus_which_is_an_interval_of_95_percent() -> None:
+    titles = {field.name: field.title for field in Candidate.FIELDS}
+    assert titles["standard_error"] == "standard error"

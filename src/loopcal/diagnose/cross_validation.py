@@ -89,7 +89,7 @@ class CrossValidation(TableResult):
 
     def page(self) -> list[Block]:
         """Return the score and the folds."""
-        text = f"Held-out score {self.score:.4g} +/- {self.standard_error:.2g} sigma^2"
+        text = f"Held-out score {self.score:.4g} (standard error {self.standard_error:.2g}) sigma^2"
         poses = f"{len(self.poses)} rows in {len(self.fold)} folds"
         return [f"{text}, {poses}; 1 is noise alone.", self.main_table()]
 
@@ -110,7 +110,7 @@ class CrossValidation(TableResult):
 
     def __repr__(self) -> str:
         error = round_to_digits(self.standard_error, 2)
-        score = f"score {round_to_digits(self.score, 4)} +/- {error}"
+        score = f"score {round_to_digits(self.score, 4)} (standard error {error})"
         return f"<CrossValidation: {len(self.fold)} folds, {len(self.poses)} rows, {score}>"
 
 
@@ -308,7 +308,7 @@ class Candidate:
         Field("name"),
         Field("parameters", show=lambda names: str(len(names))),
         Field("score", unit="sigma^2", digits=4),
-        Field("standard_error", unit="sigma^2", title="+/-", digits=2),
+        Field("standard_error", unit="sigma^2", title="standard error", digits=2),
         Field("rank", unit="1"),
         Field("condition", unit="1", digits=3),
     )

@@ -724,7 +724,7 @@ class NuisanceEstimate(TableResult):
             ("setup parameter", lambda row: row["name"]),
             (Column("estimate"), lambda row: format_with_uncertainty(row["estimate"], row["sd"])),
             (
-                Column("+/- (1 sd)"),
+                Column("standard deviation"),
                 lambda row: format_uncertainty(row["sd"]) if row["free"] else "fixed",
             ),
             ("unit", lambda row: row["unit"]),
