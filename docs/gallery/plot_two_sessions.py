@@ -54,9 +54,8 @@ comparison.plot()
 
 row = comparison.to_frame().set_index("parameter").loc[moved]
 shift, sd = row["june shift"], row["june shift_sd"]
-print(
-    f"{moved}: {shift:+.3f} {row.unit}, standard uncertainty {sd:.3f} {row.unit}, error {(shift - 0.06) / sd:+.1f} sd"
-)
+error = (shift - 0.06) / sd
+print(f"{moved}: {shift:+.3f} {row.unit} (k = 1: {sd:.3f}), error {error:+.1f} sd")
 
 cause = comparison.pairs[0]
 print(f"the cause alone: {1e3 * cause.cause_shift[0]:+.4f} +/- {1e3 * cause.cause_sd[0]:.4f} mm")
