@@ -19,6 +19,7 @@ from loopcal.apply.calibration_report import CalibrationReport
 from loopcal.apply.height_errors import restore_heights
 from loopcal.apply.run_comparison import RunComparison
 from loopcal.apply.validation import restore_validation
+from loopcal.apply.volume_accuracy import VolumeAccuracy, VolumeLike, bound_errors
 from loopcal.errors import FileError, LoopcalError
 from loopcal.estimate.posterior import posterior_from_arrays
 from loopcal.estimate.result import residuals_from_arrays
@@ -84,6 +85,19 @@ def load_record(
         ),
         facts=stated.list_rows(),
     )
+
+
+def state_volume(run: Run, volume: VolumeLike, limit: float | None) -> tuple[Run, VolumeAccuracy]:
+    """Return a run whose documents state the largest position error in a volume, as if its
+    calibration had been asked for it, and this statement; see `loopcal.bound_errors`.
+    """
+    posterior, frame = run.load_stated_errors(), run.result["options"]["frame"]
+    stated = bound_errors(posterior, volume, frame, limit=limit)
+    content = json.loads(to_json(json_fields(stated)))
+    replaced = (run.result.get("volume") or {}).get("findings", ())
+    findings = [f for f in run.result["findings"] if f not in replaced]
+    findings += content["findings"][-1:] if limit is not None else []
+    return replace(run, result=run.result | {"volume": content, "findings": findings}), stated
 
 
 def list_controllers(source: ExportSource) -> tuple[ControllerValues, ...]:

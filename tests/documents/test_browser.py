@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The report in Chromium: no requests, no errors, accessible, at most 12 pages, complete as it is.
+"""The report in Chromium: no requests, no errors, accessible, at most 9 pages, complete as it is.
 
 These tests need Chromium, which `.ci/run` installs, and the packages of the extra `test`.
 """
@@ -26,7 +26,7 @@ pytestmark = [
     pytest.mark.skipif(BROWSER is None, reason="Chromium is not installed"),
 ]
 
-MOST_PAGES = 12
+MOST_PAGES = 9
 
 WEBGL = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 """Options with which Chromium computes WebGL without a graphics card."""
@@ -268,7 +268,7 @@ def test_picture_stays_where_a_browser_has_no_webgl(program, page) -> None:
 
 
 @pytest.mark.usefixtures("do_not_draw")
-def test_option_pdf_prints_at_most_12_pages(run, tmp_path, monkeypatch, capsys) -> None:
+def test_option_pdf_prints_at_most_9_pages(run, tmp_path, monkeypatch, capsys) -> None:
     monkeypatch.chdir(tmp_path)
     assert main(["report", str(run.path), "--pdf"]) == 0
     assert capsys.readouterr().out == "Written to report.html, report.json, report.pdf\n"

@@ -27,6 +27,8 @@ from loopcal.report.scene.scene import load_script
 from loopcal.report.validation_view import view_errors
 from loopcal.report.words import say
 from loopcal.results.tables import Table
+from loopcal.units import find_unit
+from tests.io.test_certificate import write_facts
 
 pytestmark = pytest.mark.slow
 
@@ -215,6 +217,34 @@ def test_many_rows_are_thinned_and_the_report_says_so(run) -> None:
     assert "120,000 fitted poses, here the first 3,000" in text
     assert len(text) < 5e6
     assert thin_rows(rows, len(rows.raw)) is rows
+
+
+def test_a_volume_that_is_asked_for_later_is_in_report_and_certificate(
+    run, calibration, tmp_path, capsys
+) -> None:
+    """It replaces the volume of the calibration, and a limit that it misses is a failure."""
+    wanted = lc.bound_errors(calibration.identification, {"y": (-0.03, 0.03)})
+    facts = str(write_facts(tmp_path))
+    volume = ["--volume", "y=-30mm..30mm", "--limit-position", "0.1um"]
+    page = tmp_path / "later.html"
+    assert main(["report", str(run.path), "-o", str(page), *volume]) == 2
+    first = json.loads(page.with_suffix(".json").read_text())["sections"][0]["elements"]
+    bound, *_ = first[1]["rows"]
+    assert "in the working volume" in bound[0]
+    value, unit = bound[2].split()
+    assert float(value) * find_unit(unit).factor_to_si == pytest.approx(
+        wanted.simultaneous, rel=5e-3
+    )
+    assert bound[4] == "does not conform"
+    assert [row["text"].count("does not conform") for row in first[2]["list"]] == [1]
+    assert "Working volume: box y -30 mm to 30 mm" in first[3]["sentence"]
+    capsys.readouterr()
+    assert main(["certificate", str(run.path), facts, *volume]) == 2
+    text = capsys.readouterr().out
+    assert "box y -30 mm to 30 mm" in text
+    assert "box x" not in text
+    assert main(["report", str(run.path), "-o", f"{page}.html", *volume[2:]]) == 1
+    assert "no effect without --volume" in capsys.readouterr().err
 
 
 def test_limits_of_calls_are_sentences(calibration, tmp_path) -> None:

@@ -295,7 +295,7 @@ def test_characters_that_xml_cannot_hold_become_visible(tmp_path, run) -> None:
         (("begin: 2026-01-31", "begin: 2026-02-31"), "date|day is out of range|valid YAML"),
         (("end: 2026-01-31", "end: 2025-01-31"), r"'end' is 2025-01-31, before begin"),
         (("place: laboratory ", "place: cellar "), "'place' is 'cellar'.*Allowed"),
-        (('serial_number: "0017"', 'serial_number: ""'), r"facts.yaml:10: .*serial_number' is"),
+        (('serial_number: "0017"', 'serial_number: ""'), r"facts.yaml:10: .*serial_number"),
         (("machine:", "robot:"), "unknown key 'robot'"),
     ],
 )
@@ -306,7 +306,7 @@ def test_wrong_facts_are_refused_at_their_line(tmp_path, change, message) -> Non
 
 def test_template_must_be_filled_in(tmp_path) -> None:
     (tmp_path / "facts.yaml").write_text(read_template(), "utf-8")
-    with pytest.raises(FileError, match=r"facts.yaml:3: 'number' is empty. Fill it in"):
+    with pytest.raises(FileError, match=r"facts.yaml:3: .* number, country, begin, end, mach"):
         load_administration(tmp_path / "facts.yaml")
     rows = load_administration(tmp_path / "facts.yaml", is_complete=False).list_rows()
     assert not any(rows.values())  # a report leaves lines to fill in by hand

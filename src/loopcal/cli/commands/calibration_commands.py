@@ -385,7 +385,12 @@ def compensate(
 
 
 @opt.command()
-def certificate(run: Path = opt.RUN, facts: Path = opt.argument("FACTS", type=opt.FILE)) -> Output:
+def certificate(
+    run: Path = opt.RUN,
+    facts: Path = opt.argument("FACTS", type=opt.FILE),
+    volume: opt.Parts = opt.volume(),
+    limit_position: float | None = opt.LIMIT_POSITION,
+) -> Output:
     """Print a digital calibration certificate of RUN: XML by PTB's schema DCC 3.3.0.
 
     FACTS is a YAML file with facts outside the run: laboratory, customer, dates, serial number. The
@@ -395,12 +400,29 @@ def certificate(run: Path = opt.RUN, facts: Path = opt.argument("FACTS", type=op
     Examples:
       loopcal new --report-facts facts.yaml
       loopcal certificate run facts.yaml > certificate.xml
+      loopcal certificate run facts.yaml --volume radius=80mm --limit-position 20um
     """
     from loopcal.io.runs.certificate import format_certificate, load_administration
     from loopcal.io.runs.run_folder import load_run_or_robot
 
-    text = format_certificate(load_run_or_robot(run), load_administration(facts))
-    return Output({"certificate": text}, lambda: text)
+    stated, failures = _state_volume(load_run_or_robot(run), volume, limit_position)
+    text = format_certificate(stated, load_administration(facts))
+    return Output({"certificate": text, "reasons": failures}, lambda: text, failures)
+
+
+def _state_volume(
+    run: lc.Run, parts: opt.Parts, limit: float | None
+) -> tuple[lc.Run, tuple[lc.Finding, ...]]:
+    """Return a run with the largest error in the volume of the command line, if it states one, and
+    the finding of a limit that is not met.
+    """
+    from loopcal.documents import state_volume
+
+    if (region := opt.read_volume(parts, run.robot)) is None:
+        opt.refuse_given(("limit_position",), "without --volume")
+        return run, ()
+    run, stated = state_volume(run, region, limit)
+    return run, stated.failures
 
 
 @opt.command()
@@ -492,6 +514,8 @@ def report(
         "Facts to print with the results: customer, serial number, ... `loopcal new "
         "--report-facts` writes a file to fill in."
     ),
+    volume: opt.Parts = opt.volume(),
+    limit_position: float | None = opt.LIMIT_POSITION,
     force: bool = opt.force("the output files"),
 ) -> Output:
     """Write the report of RUN, a run folder, as one HTML file that needs no network.
@@ -506,6 +530,7 @@ def report(
     Examples:
       loopcal report run
       loopcal report run -o hexapod.html --pdf --facts facts.yaml
+      loopcal report run --volume radius=80mm --volume z=0mm..60mm --limit-position 20um
     """
     from loopcal.documents import check_browser, name_data, print_pdf
     from loopcal.io.core.outputs import refuse_outputs
@@ -515,12 +540,13 @@ def report(
     refuse_outputs(files, [run / name for name in calibrated.result.get("files", {})], force)
     if pdf:
         check_browser(files[-1])
+    calibrated, missed = _state_volume(calibrated, volume, limit_position)
     with terminal.TerminalProgress("writing the report") as progress:
         lc.save_report(calibrated, output, facts)
         if pdf:
             progress(0, 1, "printing the report")
             print_pdf(output, files[-1])
-    failures = [] if calibrated.failure is None else [calibrated.failure]
+    failures = [*([] if calibrated.failure is None else [calibrated.failure]), *missed]
     written = f"Written to {', '.join(str(file) for file in files)}"
     return Output({"output": files, "reasons": failures}, lambda: [written], failures)
 

@@ -96,8 +96,8 @@ class Contact(_Texts):
 
     def __str__(self) -> str:
         """Return name and address on one line."""
-        town = f"{self.country} {self.post_code} {self.city}".strip() if self.city else ""
-        return ", ".join(text for text in (self.name, self.street, town) if text)
+        place = (self.country, self.post_code, self.city) if self.city else ()
+        return ", ".join(filter(None, (self.name, self.street, " ".join(filter(None, place)))))
 
 
 @dataclass(frozen=True)
@@ -185,12 +185,15 @@ def load_administration(path: str | Path, is_complete: bool = True) -> Administr
     """
     file = read_yaml(path, "file of report facts", has_names=False)
     facts = read_record(file, file.content, Administration, None)
+    empty = []
     for location in NEEDED if is_complete else ():
         text: Any = facts
         for step in location:
             text = getattr(text, step) if isinstance(step, str) else (text or (Person(),))[step]
-        if not text.strip():
-            raise file.error(f"{name_location(location)!r} is empty. Fill it in", location)
+        empty += [] if text.strip() else [location]
+    if empty:
+        names = ", ".join(map(name_location, empty))
+        raise file.error(f"a certificate needs these texts, which are empty: {names}", empty[0])
     return facts
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cache
@@ -47,6 +48,12 @@ class Picture:
     caption: str
     description: str
     scene: str = field(default="", repr=False)
+
+    @property
+    def is_narrow(self) -> bool:
+        """Whether it is little wider than high, so that two stand side by side on paper."""
+        box = re.search(r'viewBox="0 0 (\S+) (\S+)"', self.svg)
+        return box is not None and float(box[1]) < 1.3 * float(box[2])
 
 
 @dataclass(frozen=True)

@@ -372,6 +372,7 @@ def describe_parameters(record: CalibrationRecord) -> Iterator[Element | None]:
             yield fit["interval_note"]
         if fit.get("local"):
             yield build_parameter_table("Setup parameters", fit["local"])
+    yield None  # figures before text, which fills what they leave of a page
     yield from select_findings(record, OF_PARAMETERS)
 
 
@@ -416,6 +417,7 @@ def describe_residuals(record: CalibrationRecord) -> Iterator[Element | None]:
         p_value = format_number(fit["p_value"], 2)
         u = fit["sigma_uncertainty"] if fit["noise"] == "given" else 0.0
         yield say("residuals.test", square=square, degrees=degrees, p_value=p_value, u=u)
+    yield None
     of_residuals = (f for f in record.findings if not f["code"].startswith(OF_PARAMETERS))
     yield from list_findings(f for f in of_residuals if f["code"].startswith(OF_RESIDUALS))
 
