@@ -65,19 +65,6 @@ def drive_joints(robot: Mechanism, values: FloatArray, q: FloatArray) -> DrivenJ
         return DrivenJoints(e, tau, joints_from_readings(q, tau, robot.slots.constants))
 
 
-def differentiate_transmissions(robot: Mechanism, values: FloatArray, q: FloatArray) -> FloatArray:
-    """Return the derivatives (t | 1, n | 1, J, p + a) of driven joints, as many as readings q (t |
-    1, n, a), by parameters in SI and by readings.
-    """
-    _, tau = robot.slots(values)
-    inputs = robot.all_parameters.linearize(values, tau, q)
-    joints = expand_map(robot.program, inputs)[1]
-    if robot.has_sums:  # of which the map knows no reading
-        turns = differentiate_joints_by_readings(robot, values, q)
-        return join_columns(joints[..., : len(robot.parameters)], turns)
-    return joints
-
-
 @dataclass(frozen=True, eq=False)
 class OpenSums:
     """Sums of driven joints: how many of them, the first ones, commanded readings choose, and the
@@ -153,7 +140,7 @@ def differentiate_at_pose(
                 joints[rows][:, :, limb.drives] = -(both / limb.Q)
     twists = np.broadcast_to(np.eye(m, p + m, p), (*joints.shape[:2], m, p + m))
     passive = move_passive_joints(robot, values, state, twists, joints)
-    by_inputs = differentiate_transmissions(robot, values, q)
+    by_inputs = differentiate_driven_joints(robot, values, q, state)
     joints[..., :p] -= by_inputs[..., :p]
     with np.errstate(all="ignore"):
         readings = joints / np.einsum("...jj->...j", by_inputs[..., p:])[..., None]
@@ -288,11 +275,18 @@ def differentiate_open_sums(
 def differentiate_driven_joints(
     robot: Mechanism, values: FloatArray, q: FloatArray, state: State
 ) -> FloatArray:
-    """Return derivatives (t | 1, n | 1, J, p + a) of driven joints by parameters and readings."""
+    """Return derivatives (t | 1, n | 1, J, p + a) of driven joints by parameters in SI and by
+    readings.
+    """
     if robot.has_open_sums:
         M = len(robot.program.unknown_twists)
         return _differentiate_open(robot, values, q, state)[:, :, M:]
-    return differentiate_transmissions(robot, values, q)
+    inputs = robot.all_parameters.linearize(values, robot.slots(values)[1], q)
+    joints = expand_map(robot.program, inputs)[1]
+    if robot.has_sums:  # of which the map knows no reading
+        turns = differentiate_joints_by_readings(robot, values, q)
+        return join_columns(joints[..., : len(robot.parameters)], turns)
+    return joints
 
 
 def differentiate_joints_by_readings(

@@ -219,13 +219,6 @@ def has_one_solution(robot: Mechanism) -> bool:
     return all(g.ending == "distance" and g.actuator[-1, 0] >= 0 for g in robot.program.groups)
 
 
-def has_bends(robot: Mechanism) -> bool:
-    """Return whether limbs that are closed one by one at a pose may have several readings there."""
-    if robot.is_serial or moves_by_drives(robot):
-        return False
-    return determine_platform(robot) and not has_one_solution(robot)
-
-
 def compute_bend(robot: Mechanism, state: State) -> NDArray[np.int8]:
     """Return the sign (n,) of the determinant of the limbs at their platform, every joint free: it
     changes where a limb is stretched or folded, from one working mode to another.
@@ -281,7 +274,11 @@ def judge_modes(
             sign[~is_sure] = compute_closure_sign(robot, robot.values[None], unsure)[0]
         state = replace(state, closure_sign=sign[None])
     is_other = closed & (sign != begin.closure_sign[0])
-    if has_bends(robot) and closed.any():
+    # limbs that are closed one by one at a pose may have several readings there
+    has_bends = not (moves_by_drives(robot) or has_one_solution(robot)) and determine_platform(
+        robot
+    )
+    if has_bends and closed.any():
         is_other |= closed & (compute_bend(robot, state) != compute_bend(robot, begin))
     rows = np.flatnonzero(closed & ~is_other & ~is_sure)
     if not len(rows):

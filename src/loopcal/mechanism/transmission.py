@@ -112,14 +112,6 @@ def compute_range(triangle: FloatArray) -> tuple[FloatArray, FloatArray]:
     return np.sqrt(np.maximum(level - reach, 0.0)), np.sqrt(level + reach)
 
 
-def find_side(start: float, triangle: FloatArray) -> tuple[float, float]:
-    """Return sin(theta - gamma) at a start angle, and the middle of its side, [rad]."""
-    _, _, gamma = describe_triangle(triangle)
-    lead = geometry.wrap_angle(start - gamma)
-    sine = float(np.sin(lead))
-    return sine, float(start - lead + np.sign(sine) * np.pi / 2)
-
-
 def turn_head(angle: FloatArray, triangle: FloatArray) -> FloatArray:
     """Return the head (.., 3) [m] at joint angles (..) of triangles (.., 10), h = S Rz S' H."""
     return _apply(_turn(angle, triangle), triangle[..., 3:6])

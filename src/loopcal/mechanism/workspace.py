@@ -16,6 +16,7 @@ from loopcal.engine import State
 from loopcal.errors import MechanismError
 from loopcal.findings import report_finding
 from loopcal.findings.wording import round_to_digits
+from loopcal.mechanism.kinematics import compute_limb_frames
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.solutions import Solution, inverse, make_solution
 from loopcal.mechanism.states import join_states, select_poses
@@ -64,7 +65,18 @@ def evaluate_limits(
                     name, value = f"{limb.name}.{joint.name}", joints[:, :, k, j]
                     limits.append(Limit(name, joint.dimension, *joint.limits, value))
     if any(limb.cones for limb in robot.assembly.limbs):
-        limits += _evaluate_cones(robot, values, state)
+        all_frames = compute_limb_frames(robot, values, state)
+        for limb, frames in zip(robot.assembly.limbs, all_frames, strict=True):
+            rod = frames[:, :, -1, :3, 3] - frames[:, :, -2, :3, 3]
+            rod = rod / np.linalg.norm(rod, axis=-1, keepdims=True)
+            for cone in limb.cones:
+                place, sign = (-2, 1.0) if cone.end == "tip" else (-1, -1.0)
+                unit = np.array(cone.axis) / np.linalg.norm(cone.axis)
+                axis = frames[:, :, place, :3, :3] @ unit
+                sine = np.linalg.norm(np.cross(axis, rod), axis=-1)
+                angle = np.arctan2(sine, sign * (axis * rod).sum(axis=-1))
+                name = f"inclination of {limb.name} at its {cone.end}"
+                limits.append(Limit(name, Dimension.ANGLE, 0.0, cone.angle, angle))
     return tuple(limits)
 
 
@@ -86,25 +98,6 @@ def check_limits(
             )
         allowed &= ~outside
     return allowed, findings
-
-
-def _evaluate_cones(robot: Mechanism, values: FloatArray, state: State) -> list[Limit]:
-    """Return the angles between rods and the axes of their cones."""
-    from loopcal.mechanism.kinematics import compute_limb_frames
-
-    limits = []
-    all_frames = compute_limb_frames(robot, values, state)
-    for limb, frames in zip(robot.assembly.limbs, all_frames, strict=True):
-        rod = frames[:, :, -1, :3, 3] - frames[:, :, -2, :3, 3]
-        rod = rod / np.linalg.norm(rod, axis=-1, keepdims=True)
-        for cone in limb.cones:
-            frame, sign = (frames[:, :, -2], 1.0) if cone.end == "tip" else (frames[:, :, -1], -1.0)
-            axis = frame[..., :3, :3] @ (np.array(cone.axis) / np.linalg.norm(cone.axis))
-            sine = np.linalg.norm(np.cross(axis, rod), axis=-1)
-            angle = np.arctan2(sine, sign * (axis * rod).sum(axis=-1))
-            name = f"inclination of {limb.name} at its {cone.end}"
-            limits.append(Limit(name, Dimension.ANGLE, 0.0, cone.angle, angle))
-    return limits
 
 
 @dataclass(frozen=True, eq=False)

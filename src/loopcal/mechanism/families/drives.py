@@ -15,6 +15,7 @@ from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
 
+from loopcal import geometry
 from loopcal.errors import suggest_names
 from loopcal.mechanism.assembly import AXES, FORCES, Actuator, Address, Joint, Limb, LinearMap, Load
 from loopcal.mechanism.families.placement import (
@@ -39,8 +40,8 @@ from loopcal.mechanism.transmission import (
     complete_triangle,
     compute_range,
     count_independent,
+    describe_triangle,
     evaluate_sums,
-    find_side,
     list_constants,
     nominal_terms,
 )
@@ -866,15 +867,16 @@ def choose_side(
     if not high**2 - low**2 > 4 * ON_AXIS * (terms[:6].reshape(2, 3) ** 2).sum(axis=1).max():
         sentence = "has a degenerate triangle: an anchor is on the axis of the joint, so all angles"
         raise drive.refuse(name, f"{sentence} give one length. Give anchors away from the axis")
-    sine, middle = find_side(start, terms)
-    if abs(sine) < DEAD:
+    lead = float(geometry.wrap_angle(start - describe_triangle(terms)[2]))
+    side = np.sign(np.sin(lead))
+    if abs(np.sin(lead)) < DEAD:
         raise drive.refuse(
             name,
             f"does not turn its joint at {np.rad2deg(start):g} deg, a dead point of its triangle: "
             "both anchors and the axis are in one plane. Give another `start:` of the joint, or "
             "other anchors",
         )
-    return {"side": float(np.sign(sine)), "middle": middle}
+    return {"side": float(side), "middle": float(start - lead + side * np.pi / 2)}
 
 
 def list_triangle_terms(drive: TriangleDrive, rotation: FloatArray) -> Iterator[tuple[str, Term]]:

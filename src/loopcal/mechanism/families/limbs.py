@@ -360,13 +360,19 @@ def _place_bodies(record: Limbs, limbs: Sequence[Limb]) -> dict[str, FloatArray]
 
 
 def follow_rigid_limbs(known: dict[str, FloatArray], limbs: Sequence[Limb]) -> None:
-    """Add the poses of bodies that rigid limbs join to bodies of known poses."""
+    """Add the poses of bodies that rigid limbs join to bodies of known poses, by their joints at
+    start.
+    """
     count = 0
     while count < len(known):
         count = len(known)
         for limb in limbs:
             if limb.ending == "rigid" and (limb.on in known) != (limb.to in known):
-                step = _follow_at_start(limb) @ invert_pose(limb.attachment.transform)
+                step = limb.links[0].transform
+                for joint, link in zip(limb.joints, limb.links[1:], strict=True):
+                    at_start = np.array(joint.start), np.array(joint.pitch)
+                    step = step @ move_joint(joint.kind, *at_start) @ link.transform
+                step = step @ invert_pose(limb.attachment.transform)
                 if limb.on in known:
                     known[limb.to] = known[limb.on] @ step
                 else:
@@ -398,15 +404,6 @@ def _check_ends(limbs: Sequence[Limb], names: Sequence[str]) -> None:
                 f"limb {limb.name!r} begins and ends on {limb.on!r}, which it cannot move. Name "
                 "two bodies under `on:` and `to:`"
             )
-
-
-def _follow_at_start(limb: Limb) -> FloatArray:
-    """Return the tip (4, 4) of a limb in the body where it begins, its joints at their start."""
-    T = limb.links[0].transform
-    for joint, link in zip(limb.joints, limb.links[1:], strict=True):
-        motion = move_joint(joint.kind, np.array(joint.start), np.array(joint.pitch))
-        T = T @ motion @ link.transform
-    return T
 
 
 def _place_copy(

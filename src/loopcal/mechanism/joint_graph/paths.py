@@ -200,18 +200,6 @@ def _walk_limbs(joints: Sequence[GraphJoint], nodes: Sequence[str]) -> Iterator[
             yield limb.reverse() if is_turned else limb
 
 
-def place_limbs(block: Block, home: FloatArray, T_body_frame: FloatArray) -> LimbPaths:
-    """Return the limbs of a block at its home pose (j,), for a frame (4, 4) of its platform.
-
-    Loops are closed in all components of twist that one of their joints can have.
-    """
-    graph, platform = block.graph, block.platform
-    freedoms = list_freedoms(graph, home, platform, T_body_frame, of_joints=True)
-    motions = find_freedoms(graph, home, platform)
-    limbs = _keep_shifts_in_plane(graph, home, find_limbs(graph, platform), freedoms)
-    return LimbPaths(graph, home, platform, limbs, freedoms, motions)
-
-
 def _keep_shifts_in_plane(
     graph: JointGraph, home: FloatArray, limbs: tuple[GraphLimb, ...], freedoms: tuple[str, ...]
 ) -> tuple[GraphLimb, ...]:
@@ -387,7 +375,11 @@ def find_stage_paths(
         if block.is_serial and len(blocks) > 1 and block.graph.tree[0].is_plain:
             stages.append(SerialStage(block.graph.tree[0], float(values[0]), frame))
         else:
-            closed = place_limbs(block, values, frame)
+            # loops are closed in all components of twist that one of their joints can have
+            own = block.graph, values, block.platform
+            freedoms = list_freedoms(*own, frame, of_joints=True)
+            limbs = _keep_shifts_in_plane(*own[:2], find_limbs(*own[::2]), freedoms)
+            closed = LimbPaths(*own, limbs, freedoms, find_freedoms(*own))
             if closed.motions.mobility == 0:
                 raise MechanismError(report_finding("files.no-motion", platform=block.platform))
             stages.append(ClosedStage(closed, mount, _align_frame(closed, frame)))
