@@ -242,7 +242,7 @@ class _Rows:
                     moved.append(move_serial(robot.program.groups[0], *links, own[:, 0]))
                     continue
                 if sums is not None:
-                    weights, own = sums.weights, sums.complete(own)
+                    weights, own = sums.weights, sums.complete(u[:, None, stage.actuators])
                 state = Loops(robot, e, weights).close(own, next(loops), follow=False)
                 by_drive = differentiate_by_drives(robot, e, own, state, weights)[:, 0]
                 moved.append((state.T[:, 0], by_drive[..., : sums and sums.chosen]))

@@ -641,6 +641,7 @@ def test_redundant_readings_may_be_sums(tmp_path: Path, name: str) -> None:
     there = forward(robot, measure(robot, reached.T))
     assert there.converged.all()
     assert_allclose(there.T, reached.T, rtol=0, atol=1e-9)
+    assert_allclose(inverse(robot, reached.T).q, reached.q, rtol=0, atol=1e-9)
     check_pose_derivatives(robot, there.q[None, :3])
 
 

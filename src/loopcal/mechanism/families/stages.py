@@ -241,7 +241,7 @@ def _refuse_wrong_drives(stages: Sequence[AttachedStage], is_coupled: bool) -> N
             if drive in owner:
                 raise StageError(
                     f"actuator {drive!r} drives the stages {owner[drive]!r} and {stage.name!r}. "
-                    "Give each stage its own drives",
+                    "Give each stage its own drives, or one `drive: none` and a coupling",
                     i,
                 )
         owner |= dict.fromkeys(own, stage.name)
