@@ -128,4 +128,4 @@ def test_measured_lengths_correct_a_board_printed_at_97_percent(
         loopcal(f"calibrate hexapod-42 {name}.csv -o {name}", code=(0, 2))
     plain, shrunk = (lc.load_run(name) for name in ("plain", "shrunk"))
     assert np.abs(shrunk.robot.values - plain.robot.values).max() < 2e-6  # [m, rad]
-    assert "board.scale_x: {start: -0.03," in Path("shrunk.csv").read_text("utf-8")
+    assert "board.scale_x: {start: -30000 ppm," in Path("shrunk.csv").read_text("utf-8")

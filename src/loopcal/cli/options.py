@@ -12,7 +12,7 @@ import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import wraps
 from importlib import import_module
 from inspect import cleandoc, signature
@@ -697,9 +697,13 @@ INSTRUMENT: Any = Group(
 # The short form of components, and unknown frames and targets, for `make_instrument`.
 UNKNOWN: Any = Group(
     measure=option(
-        "Short for --kind component --components NAMES: some of x,y,z,phi,theta,psi. In loopcal "
-        "plan also plane-line: points on planes with a line.",
+        "Short for --kind component --components NAMES: some of x,y,z,phi,theta,psi. Or camera: "
+        "pictures of a printed board, from the best place. In loopcal plan also plane-line: points "
+        "on planes with a line.",
         type=NAMES,
+    ),
+    board=path(
+        "With --measure camera: file of the board, by loopcal board. Default: 10 x 7 squares."
     ),
     unknown_frames=option(
         "Unknown frames: base (the frame of the instrument in the base), tool, or base,tool.",
@@ -739,16 +743,31 @@ SIGMA_READING: Any = option(
 )
 
 
-def make_instrument(stated: Mapping[str, Any], robot: lc.Mechanism | None = None) -> lc.Instrument:
+CAMERA = "camera"  # word of --measure for pictures of a printed board
+
+
+def make_instrument(
+    stated: Mapping[str, Any],
+    robot: lc.Mechanism | None = None,
+    options: lc.PlanOptions | None = None,
+) -> lc.Instrument:
     """Return the instrument of `INSTRUMENT`, and of `UNKNOWN` and the distribution where they are
     stated: fields of the library's `InstrumentDescription`.
 
     `robot` : gives targets of unknown place an assumed one, and joints their dimension; only needed
-    where there are any.
+    where there are any. `options` : of a plan, for the place of a camera.
     """
     from loopcal.apply import simulated_measurements
 
     described = {key: value for key, value in stated.items() if value is not None}
+    board = described.pop("board", None)
+    if described.get("measure") == (CAMERA,) and robot is not None:
+        others = (*INSTRUMENT.members, "unknown_frames", "targets")
+        sentence = "{reason} takes no {option}. Leave it out, or describe the camera with --like"
+        refuse_given(others, "--measure camera", sentence)
+        return _place_camera(robot, board, options)
+    if board is not None:
+        raise DataError("--board belongs to --measure camera. Add it, or leave --board out")
     if (components := described.pop("measure", None)) is not None:
         if "components" in described or described["kinds"] != ("pose",):
             raise DataError(
@@ -762,6 +781,27 @@ def make_instrument(stated: Mapping[str, Any], robot: lc.Mechanism | None = None
     )
     _print_assumed_sigma(instrument)
     return instrument if robot is None else simulated_measurements.place_targets(instrument, robot)
+
+
+def _place_camera(
+    robot: lc.Mechanism, file: Path | None, options: lc.PlanOptions | None
+) -> lc.Instrument:
+    """Return a camera at its best station, and print where that is."""
+    from loopcal.io.pictures import choose_board, read_board
+    from loopcal.measure.kinds.image import Image
+    from loopcal.planning.camera_stations import choose_station
+
+    if file is None:  # a square is about 1/20 of the robot
+        step = 10.0 ** math.floor(math.log10(0.05 * robot.size))
+        board = choose_board(10, 7, math.ceil(0.05 * robot.size / step) * step)
+    else:
+        board = read_board(file)
+    measured = replace(board, measured=board.measured or board.marks)
+    camera = Image(corners=board.corners, square=board.square)
+    with terminal.TerminalProgress() as progress:
+        instrument, station = choose_station(robot, camera, options, measured.scales, progress)
+    terminal.print_finding(station.code, **station.data)
+    return instrument
 
 
 def _print_assumed_sigma(instrument: lc.Instrument) -> None:

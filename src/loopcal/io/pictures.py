@@ -27,7 +27,9 @@ from loopcal.io.core.csv_table import format_row, read_table
 from loopcal.io.core.limits import make_name
 from loopcal.io.core.records import read_record
 from loopcal.io.core.yaml_file import format_flow, format_yaml, read_yaml
+from loopcal.io.data.kind_settings import describe_kind, describe_stated_values
 from loopcal.io.robot.robot_file import check_format
+from loopcal.measure.kinds.image import PRINT_SD, Image, state_camera
 from loopcal.typing import FloatArray, IntArray
 from loopcal.units import Length
 
@@ -96,6 +98,16 @@ class Board:
         spans = (max(1, min(n, int(CALIPER / self.square + 1e-9))) for n in self.squares)
         x, y = (span * self.square for span in spans)
         return x, y
+
+    @property
+    def scales(self) -> tuple[tuple[float, float], ...]:
+        """Scales of the print along x and y by its lengths, with their standard deviations."""
+        if self.measured is None:
+            return ((0.0, PRINT_SD),) * 2
+        return tuple(
+            (round(found / mark - 1.0, 9), round(self.measured_sd / mark, 9))
+            for found, mark in zip(self.measured, self.marks, strict=True)
+        )
 
 
 def choose_board(columns: int, rows: int, square: float) -> Board:
@@ -518,10 +530,12 @@ def format_pictures(
     board: Board,
     pictures: Sequence[Picture],
     names: Mapping[Path, str],
-    settings: Mapping[str, Any],
+    mount: str,
+    sigma: float,
+    beside: Mapping[str, str],
 ) -> str:
-    """Return the measurement file of the pictures without a fault; `settings` as the kind `image`
-    has them, such as mount and noise.
+    """Return the measurement file of the pictures without a fault. mount : of the kind `image`.
+    sigma : [px] of u and v. beside : setting that names the table with the readings.
     """
     good = [picture for picture in pictures if picture.fault is None]
     if not good:
@@ -530,24 +544,14 @@ def format_pictures(
             report_finding("pictures.none", count=len(pictures), name=name, reason=reason)
         )
     focals = [picture.focal for picture in good if picture.focal is not None]
-    known: dict[str, Any] = {"kind": "image", **settings}
-    known |= {"corners": board.corners, "square": f"{1e3 * board.square:g} mm"}
-    known |= {"size": good[0].size}
-    if focals:
-        known["focal"] = [f"{float(np.median(focals)):.0f} px"] * 2
-    known["unknown"] = ["camera", "board", "focal", "center", "radial", "print"]
-    width = max(good[0].size)
-    values: dict[str, Any] = {"camera.c?": {"sd": f"{0.02 * width:.0f} px"}, "camera.k3": "fixed"}
-    if board.measured is None:
-        values["board.scale_?"] = {"sd": 0.02}
-    else:
-        for axis, found, mark in zip("xy", board.measured, board.marks, strict=True):
-            scale = {
-                "start": round(found / mark - 1.0, 9),
-                "sd": round(board.measured_sd / mark, 9),
-            }
-            values[f"board.scale_{axis}"] = scale
-    known["unknowns"] = values
+    focal = round(float(np.median(focals))) if focals else None
+    camera = Image(mount=mount, corners=board.corners, square=board.square, size=good[0].size)
+    if focal is not None:
+        camera = replace(camera, focal=(focal, focal))
+    camera, stated = state_camera(camera, board.scales)
+    known = describe_kind(camera, dict.fromkeys("uv", sigma), np.eye(4), is_noise_assumed=True)
+    known |= beside
+    known["unknowns"] = describe_stated_values(stated, camera.nuisance_parameters)
     lines = [f"# {key}: {format_flow(value)}" for key, value in known.items()]
     lines.append("pose,corner,u [px],v [px]")
     for picture in good:

@@ -343,6 +343,7 @@ def plan(
       loopcal plan hexapod-42 -o plan --kind position --seen-from 1.5m,-0.8m,0.6m --cone 60deg
       loopcal plan my-hexapod.yaml -o plan --like tracker.csv --measured last-week.csv
       loopcal plan run/robot.yaml -o check --check-up --like tracker.csv
+      loopcal plan hexapod-42 -o plan --measure camera --board board.yaml
       loopcal plan hexapod-nategh-agheli -o plan --measure plane-line --groups 10 --points 8
     """
     from loopcal.io.core.outputs import refuse_folder
@@ -368,7 +369,8 @@ def plan(
         if opt.is_given("groups") or opt.is_given("points"):
             raise DataError("--groups and --points belong to --measure plane-line. Leave them out")
         if like is None:
-            measuring = opt.make_instrument(unknown | instrument, machine)
+            placed = lc.PlanOptions(constraints=constraints, frame=frame, seed=seed)
+            measuring = opt.make_instrument(unknown | instrument, machine, placed)
         else:
             described = (*opt.UNKNOWN.members, *opt.INSTRUMENT.members)
             sentence = "{reason} describes the instrument. Leave out {option}, or --like"
@@ -410,14 +412,15 @@ def plan(
     document = terminal.add_findings({"format": FORMAT, **result.to_dict(), "made_by": made_by})
     written = _write_plan(output, result, document, force)
     data = (*measured, output / "measurements.csv")
+    board = ("--board", unknown["board"] or "board.yaml")
+    pictured = (*board, "--poses", output / "poses.csv", "-o", output / "points.csv")
+    following = (
+        *(("check-up", "RUN", data[-1]) if check_up else ()),
+        *(("photos", "PICTURES", *pictured) if unknown["measure"] == (opt.CAMERA,) else ()),
+    ) or ("calibrate", robot, *data, "-o", "run")
     page = [
-        str(result),
-        *list_hints(result.findings),
-        "",
-        f"Written to {output}: {written}",
-        suggest_command("check-up", "RUN", output / "measurements.csv")
-        if check_up
-        else suggest_command("calibrate", robot, *data, "-o", "run"),
+        *(str(result), *list_hints(result.findings), ""),
+        *(f"Written to {output}: {written}", suggest_command(*following)),
     ]
     return Output(document, lambda: page)
 
@@ -451,6 +454,8 @@ def _write_plan(
             plan_folder.SHEET: plan_folder.format_sheet(result, list_stops(result)),
             plan_folder.DATA: plan_folder.format_plan_data(result),
         }
+        if any(sensor.kind.label_count for sensor in result.instrument.sensors):
+            texts[plan_folder.POSES] = plan_folder.format_poses(result)
         figures["plan.png"] = draw_plan(result)
         if result.curve is not None:
             figures["curve.png"] = draw_curve(result.robot, result.curve)
@@ -605,9 +610,7 @@ def photos(
             found[path] = answer.result or of.Picture(path, fault=lost)
             progress(len(found), len(paths), "finding corners")
     pictures = of.compare_pictures([found[path] for path in paths])
-    settings: dict[str, Any] = {"noise": dict.fromkeys("uv", f"{sigma:g} px")}
-    settings |= {"noise_source": "assumed", "mount": mount, **beside}
-    text = of.format_pictures(known, pictures, names, settings)
+    text = of.format_pictures(known, pictures, names, mount, sigma, beside)
     write_files({output: text, page_file: of.format_contact_sheet(pictures, names)})
     used = [picture for picture in pictures if picture.fault is None]
     shown = [

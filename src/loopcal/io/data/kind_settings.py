@@ -440,17 +440,14 @@ def _read_values_of_file(
     return values
 
 
-def read_common_errors(file: YamlFile, kinds: Sequence[KindRows]) -> tuple[StatedValue, ...]:
-    """Return the priors of the common errors of instruments, as the settings of kinds or of their
-    parameters state them for all sessions.
-    """
+def read_setup_priors(file: YamlFile, kinds: Sequence[KindRows]) -> tuple[StatedValue, ...]:
+    """Return the knowledge of setup parameters that settings state for all sessions."""
     priors = [value for entry in kinds for value in entry.shared_errors]
     stated = file.content.get(KEY, {})
     for entry in kinds:
-        parameters = entry.kind.nuisance_parameters
-        common = [parameters[i] for i in entry.kind.common_errors]
         for pattern, node in stated.items() if isinstance(stated, dict) else ():
-            if matching := [e for e in common if fnmatchcase(e.name, pattern)]:
+            parameters = entry.kind.nuisance_parameters
+            if matching := [p for p in parameters if fnmatchcase(p.name, pattern)]:
                 priors += _read_one(file, node, matching, (KEY, pattern))
     return tuple(dict.fromkeys(priors))
 

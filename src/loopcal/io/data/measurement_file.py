@@ -66,9 +66,9 @@ from loopcal.io.data.kind_settings import (
     describe_stated_values,
     has_measured_values,
     match_names,
-    read_common_errors,
     read_kinds,
     read_observations,
+    read_setup_priors,
     read_stated_values,
 )
 from loopcal.io.robot.robot_file import check_format, list_shipped_robots, load_robot
@@ -719,7 +719,7 @@ def _build_instrument(table: Table, kinds: Sequence[KindRows]) -> Instrument:
                 raise table.settings.error(sentence, (*entry.location, "noise"))
         sigma = np.array([entry.noise[column.name] for column in entry.kind.noise_columns])
         sensors.append(Sensor(entry.kind, Gaussian(sigma)))
-    return Instrument(tuple(sensors), read_common_errors(table.settings, kinds))
+    return Instrument(tuple(sensors), read_setup_priors(table.settings, kinds))
 
 
 # Text of measurement files and of templates.

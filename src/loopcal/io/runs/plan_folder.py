@@ -3,6 +3,7 @@
 
     plan.csv           the operator's sheet: the commands step by step, in the units of the robot
     measurements.csv   the data file to fill in: poses and readings, without measured values
+    poses.csv          poses and readings alone, where pictures bring the measured values
     plan.json          the plan in SI
     plan.png           the poses and the path through them
     curve.png          expected errors by the number of poses
@@ -37,7 +38,9 @@ if TYPE_CHECKING:
 
 FORMAT = 1
 SHEET, DATA, RESULT = "plan.csv", "measurements.csv", "plan.json"
-PLAN = FolderKind("plan", RESULT, ("robot", "made_by"), (SHEET, DATA, "plan.png", "curve.png"))
+POSES = "poses.csv"
+FILES = (SHEET, DATA, POSES, "plan.png", "curve.png")
+PLAN = FolderKind("plan", RESULT, ("robot", "made_by"), FILES)
 VIA = "via"
 DIGITS = 12  # significant digits of a number: more than it was rounded to, fewer than a double has
 
@@ -99,6 +102,16 @@ def format_plan_data(plan: Plan) -> str:
     instrument = replace(plan.instrument, sensors=sensors)
     labels = plan.poses.labels
     return format_data_sheet(plan.robot, instrument, readings, labels, plan.poses.held_out)
+
+
+def format_poses(plan: Plan) -> str:
+    """Return names, uses and readings of the poses, in the order of visiting."""
+    count, poses = len(plan.robot.actuators), plan.poses
+    headers, factors = (of[-count:] for of in _list_columns(plan.robot))
+    rows = zip(poses.labels, poses.uses, poses.readings.tolist(), strict=True)
+    lines = [format_row(["pose", USE_COLUMN.name, *headers])]
+    lines += [format_row([name, use, *map(_format, q, factors)]) for name, use, q in rows]
+    return "\n".join(lines) + "\n"
 
 
 def find_plan_sheet(data: Path) -> Path:

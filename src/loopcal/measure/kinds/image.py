@@ -16,7 +16,7 @@ Arrays of pictures: n pictures of k points; a point that a picture lacks is NaN.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import ClassVar, NamedTuple, Self
@@ -29,6 +29,7 @@ from loopcal.geometry import align_point_sets, solve_frame_and_points, solve_han
 from loopcal.measure.array_checks import check_pose, set_fields
 from loopcal.measure.kinds import setup_parameters as setup
 from loopcal.measure.kinds.kind import Column, Evaluation, InvalidRows, Kind, checked, list_rows
+from loopcal.measure.nuisance import StatedValue
 from loopcal.numerics.elimination import eliminate_columns
 from loopcal.numerics.statistics import choose_evenly
 from loopcal.typing import BoolArray, FloatArray, IntArray
@@ -50,6 +51,8 @@ LENS_ITEMS: Mapping[str, tuple[str, ...]] = {
 }  # fmt: skip
 PRINT, BEND = ("scale_x", "scale_y"), ("bend_x", "bend_y", "bend_xy")
 PICTURES = 40  # pictures, evenly chosen, of which start values are made
+# Standard deviations of what nobody measured: a center as a share of the width, a scale of a print.
+CENTER_SD, PRINT_SD = 0.02, 0.02
 GRAZING = 0.2  # sine of the angle between board and line of sight below which no corner is found
 
 
@@ -677,6 +680,23 @@ class Image(Kind):
             }
             for frame, tool in pairs
         ]
+
+
+def state_camera(
+    camera: Image, scales: Sequence[tuple[float, float]] = ((0.0, PRINT_SD),) * 2
+) -> tuple[Image, tuple[StatedValue, ...]]:
+    """Return a camera of which all that pictures determine is unknown, and what is known before.
+
+    scales : those of the print along x and y, with their standard deviations. All sessions share
+    them. They give the machine its size, which pictures do not determine.
+    """
+    unknown = ("camera", "board", "focal", "center", "radial", "print")
+    lens, center = camera.lens or camera.camera, CENTER_SD * max(camera.size)
+    stated = [StatedValue(f"{lens}.{name}", center) for name in LENS_ITEMS["center"]]
+    stated.append(StatedValue(f"{lens}.k3"))
+    stated += [StatedValue(f"{camera.board}.{name}", sd, scale, scope="all")
+               for name, (scale, sd) in zip(PRINT, scales, strict=True)]  # fmt: skip
+    return replace(camera, unknown=unknown), tuple(stated)
 
 
 def _turn(arm: FloatArray, slope: FloatArray) -> FloatArray:
