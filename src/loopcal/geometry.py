@@ -627,9 +627,9 @@ def minimize_over_rotations(H: FloatArray, g: FloatArray, count: int = 3) -> lis
     to the unconstrained minimum and at the 24 rotations of a cube. Near a minimum it converges
     quadratically however large the residual is, where Gauss-Newton does not.
     """
-    free = [solve_least_squares(*each).reshape(1, 3, 3) for each in zip(H, g, strict=True)]
+    free = (np.linalg.pinv(H, rcond=ALIGNMENT_TOLERANCE) @ g[..., None]).reshape(-1, 1, 3, 3)
     cube = np.broadcast_to(OCTAHEDRAL_ROTATIONS, (len(H), *OCTAHEDRAL_ROTATIONS.shape))
-    R = np.concatenate([project_to_rotations(np.array(free)), cube], axis=1).reshape(-1, 3, 3)
+    R = np.concatenate([project_to_rotations(free), cube], axis=1).reshape(-1, 3, 3)
     of = np.repeat(np.arange(len(H)), 1 + len(OCTAHEDRAL_ROTATIONS))
     size = np.maximum(np.trace(H, axis1=1, axis2=2), TINY)[:, None]
     H, g = H / size[..., None], g / size  # values and curvatures of order one
@@ -649,7 +649,7 @@ def minimize_over_rotations(H: FloatArray, g: FloatArray, count: int = 3) -> lis
         radius[active] = np.where(better, np.minimum(1.0, 2.0 * radius[active]), 0.25 * longest)
         active = active[longest > ROTATION_CHANGE]
     ends = zip(np.split(R, len(H)), np.split(value, len(H)), strict=True)
-    return [_select_distinct(each[np.argsort(of_each)])[:count] for each, of_each in ends]
+    return [_select_distinct(each[np.argsort(of_each)], count) for each, of_each in ends]
 
 
 def _evaluate_form(H: FloatArray, g: FloatArray, R: FloatArray) -> FloatArray:
@@ -672,13 +672,16 @@ def _find_newton_step(H: FloatArray, g: FloatArray, R: FloatArray) -> FloatArray
     return -(axes @ (along / np.maximum(np.abs(size), FLATTEST))[..., None])[..., 0]
 
 
-def _select_distinct(R: FloatArray) -> FloatArray:
-    """Return the rotations (k, 3, 3) with entries more than 0.02 from all earlier ones."""
-    kept: list[FloatArray] = []
-    for rotation in R:
-        if all(np.abs(rotation - other).max() > 0.02 for other in kept):
-            kept.append(rotation)
-    return np.array(kept)
+def _select_distinct(R: FloatArray, count: int) -> FloatArray:
+    """Return the first `count` of rotations (k, 3, 3) with entries more than 0.02 from all of these
+    before.
+    """
+    near = (np.abs(R[:, None] - R).max(axis=(2, 3)) <= 0.02).tolist()
+    kept: list[int] = []
+    for i, is_near in enumerate(near):
+        if len(kept) < count and not any(is_near[j] for j in kept):
+            kept.append(i)
+    return R[kept]
 
 
 def solve_hand_eye(

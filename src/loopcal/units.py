@@ -212,19 +212,21 @@ def find_unit(symbol: str, dimension: Dimension | None = None) -> Unit:
     UnitError
         Unknown symbol, or a unit of another than the given dimension; lists the allowed ones.
     """
-    known, allowed = UNITS.get(symbol), list_symbols(dimension)
+    known = UNITS.get(symbol)
+    if known is not None and dimension in (None, known.dimension):
+        return known
+    allowed = list_symbols(dimension)
     if known is None:
         raise UnitError(
             f"unknown unit {symbol!r}{suggest_names(symbol, allowed)}. Allowed: "
             f"{', '.join(allowed)}"
         )
-    if dimension is not None and known.dimension is not dimension:
-        needed = ARTICLES.get(dimension, f"a {dimension.value}")
-        raise UnitError(
-            f"{symbol!r} is a unit of {known.dimension.value}, not of {needed}. "
-            f"Allowed: {', '.join(allowed)}"
-        )
-    return known
+    assert dimension is not None
+    needed = ARTICLES.get(dimension, f"a {dimension.value}")
+    raise UnitError(
+        f"{symbol!r} is a unit of {known.dimension.value}, not of {needed}. "
+        f"Allowed: {', '.join(allowed)}"
+    )
 
 
 # A number of a file. Python also reads `1_000` and digits of other alphabets.

@@ -15,6 +15,7 @@ from numpy.testing import assert_allclose
 
 import loopcal as lc
 from loopcal import geometry
+from loopcal.estimate import fit_analysis
 from loopcal.estimate.identification import identify
 from loopcal.estimate.options import FitOptions
 from loopcal.estimate.penalties import LeastSquares
@@ -237,3 +238,13 @@ def test_tool_offset_is_estimated_and_a_wrong_one_is_detected():
             options=FitOptions(nuisance=fix_setup(data, "tool.*", true | {"tool.y": 1.1e-3})),
         )
     )
+
+
+def test_a_covariance_needs_no_estimate_of_setup_without_stated_uncertainty(monkeypatch):
+    kind = Position(places=POINT, unknown=("frame", "targets"))
+    sensor = make_sensor(kind, session=np.repeat(["one", "two"], 20))
+    data = simulate_measurements(hexapod_poses(40), sensor, true={})
+    assert data.nuisance_parameters is data.nuisance_parameters  # collected once
+    fit = identify(hexapod(), data, lc.MAP())
+    monkeypatch.setattr(fit_analysis, "estimate_nuisance", None)
+    assert np.isfinite(fit.covariance).all()

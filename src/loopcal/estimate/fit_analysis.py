@@ -273,7 +273,8 @@ class FitAnalysis:
         """
         stated = {name: self._later(f"stated_{name}") for name in COMPLETED}
         result = add_factor_uncertainty(self._identification(**stated), self.fit)
-        result = add_setup_uncertainty(result, self.fit)
+        if (setup := self.weighted.nuisance) is not None and setup.has_prior.any():
+            result = add_setup_uncertainty(result, self.fit)
         if self.options.loss is None:
             return result
         blocks = linked_blocks(self.data)

@@ -487,8 +487,6 @@ def add_setup_uncertainty(result: Identification, fit: Descent) -> Identificatio
         return result
     setup = result.nuisance
     stated = setup.table.free & ~np.isnan(setup.table.tolerance)
-    if not stated.any():
-        return result
     V, information = fit.decomposition.directions[0], fit.decomposition.singular_values[0] ** 2
     rows = (setup.slope[stated] / setup.table.tolerance[stated, None]) @ V
     used = fit.decomposition.used[0]

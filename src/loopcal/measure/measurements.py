@@ -237,7 +237,7 @@ class Measurements(TableResult):
         assumed = {rows.is_noise_assumed for rows in self.observations}
         return "mixed" if len(assumed) > 1 else "assumed" if True in assumed else "stated"
 
-    @property
+    @cached_property
     def nuisance_parameters(self) -> NuisanceParameters:
         """The nuisance parameters of the observations, with their stated values."""
         return collect_nuisance_parameters(self.all_observations, self.labels, self.stated_values)

@@ -172,12 +172,10 @@ def collect_nuisance_parameters(
             for scope in {p.scope for p in kind.nuisance_parameters}
         }
         keys = list(zip(*owners.values(), strict=True)) if owners else [()] * len(rows.session)
+        own = [replace(p, scope=ALL) if p.name in common else p for p in kind.nuisance_parameters]
         names = {}
         for key in dict.fromkeys(keys):
             owner = dict(zip(owners, key, strict=True)) | {ALL: ""}
-            own = [
-                replace(p, scope=ALL) if p.name in common else p for p in kind.nuisance_parameters
-            ]
             names[key] = [_enter(entries, p, owner[p.scope], kind) for p in own]
             for parameter, name in zip(own, names[key], strict=True):
                 in_sessions.setdefault(parameter.name, []).append(name)

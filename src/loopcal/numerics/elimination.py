@@ -601,10 +601,16 @@ def _fold_in_place(out: FloatArray, used: int, rows: FloatArray, places: IntArra
             index = np.full(n, -1)
             index[chosen] = np.arange(len(chosen))
             mine = np.flatnonzero(index[places] >= 0)
-            stacked = np.zeros((a, len(chosen), height, w))
-            stacked[:, :, :used] = out[:, chosen, :used]
-            stacked[:, index[places[mine]], used + within[mine]] = rows[:, mine]
-            triangle = np.asarray(np.linalg.qr(stacked, mode="r"))
+            stacked = np.zeros((a, len(chosen), height - used, w))
+            stacked[:, index[places[mine]], within[mine]] = rows[:, mine]
+            if height < w:  # fewer rows than columns: no others may come from rounding
+                whole = np.concatenate([out[:, chosen, :used], stacked], axis=2)
+                triangle = np.asarray(np.linalg.qr(whole, mode="r"))
+            else:
+                begun = np.zeros((a, len(chosen), w, w))
+                begun[:, :, :used] = out[:, chosen, :used]
+                flat = (each.reshape(a * len(chosen), -1, w) for each in (begun, stacked))
+                triangle = engine.fold(*flat).reshape(begun.shape)
             out[:, chosen, : triangle.shape[2]] = triangle
 
 

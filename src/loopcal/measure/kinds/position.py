@@ -311,8 +311,9 @@ class Position(TargetKind):
         is_framed = "frame" in self.unknown and len(positions) > 0
         if not self.unknown or (len(positions) < 3 and not is_framed):
             return self.nominal_values[None]
-        if "frame" in self.unknown and len(positions) > 2:  # two leave a rotation open
-            self._check_extent(positions)
+        # two leave a rotation open
+        if "frame" in self.unknown and len(positions) > 2 and _are_collinear(positions):
+            raise self._report_line(len(positions))
         if "targets" not in self.unknown:
             return setup.encode_frame(self.T_base_frame, align_point_sets(positions, points))[None]
         base = positions @ self.T_base_frame[:3, :3].T + self.T_base_frame[:3, 3]
@@ -327,34 +328,33 @@ class Position(TargetKind):
         (s, r), k = measured.shape[:2], len(self.targets)
         positions = np.where(is_row[..., None], measured, np.nan).reshape(s, r * k, 3)
         guesses: list[FloatArray | DataError] = [self.nominal_values[None]] * s
-        chosen = []
-        for j, of_set in enumerate(positions):
-            complete = of_set[~np.isnan(of_set).any(axis=1)]
-            if len(complete) >= 3:
-                try:
-                    self._check_extent(complete)
-                    chosen.append(j)
-                except DataError as error:
-                    guesses[j] = error
-        if chosen:
+        count = (~np.isnan(positions).any(axis=2)).sum(axis=1)
+        chosen = np.flatnonzero(count >= 3)
+        if chosen.size:
+            is_flat = _are_collinear(positions[chosen])
+            for j in chosen[is_flat]:
+                guesses[j] = self._report_line(int(count[j]))
+            chosen = chosen[~is_flat]
+        if chosen.size:
             own = np.broadcast_to(T, (s, *T.shape[1:]))[chosen]
             moving = own[:, :, None, :3, None, :3] * np.eye(k)[:, None, :, None]
             moving = moving.reshape(len(chosen), r * k, 3, 3 * k)
             origin = np.repeat(own[:, :, :3, 3], k, axis=1)
             solved = solve_frame_and_points(positions[chosen], moving, origin)
-            for j, (frames, places) in zip(chosen, solved, strict=True):
-                items = {"frame": setup.encode_frame(self.T_base_frame, frames), "targets": places}
-                guesses[j] = self.assemble_values(items)
+            frames, places = (np.concatenate(part) for part in zip(*solved, strict=True))
+            items = {"frame": setup.encode_frame(self.T_base_frame, frames), "targets": places}
+            ends = np.cumsum([len(of_set) for of_set, _ in solved])[:-1]
+            for j, of_set in zip(chosen, np.split(self.assemble_values(items), ends), strict=True):
+                guesses[j] = of_set
         return guesses
 
-    def _check_extent(self, positions: FloatArray) -> None:
-        """Refuse positions (q, 3) from which an unknown frame does not follow."""
-        if _are_collinear(positions):
-            raise DataError(
-                f"the {len(positions)} positions are collinear, so the rotation of the frame "
-                f"{self.frame!r} about their line stays open. Measure poses off the "
-                f"line, or give a known T_base_frame"
-            )
+    def _report_line(self, count: int) -> DataError:
+        """Return why an unknown frame does not follow from `count` positions on a line."""
+        return DataError(
+            f"the {count} positions are collinear, so the rotation of the frame {self.frame!r} "
+            f"about their line stays open. Measure poses off the line, or give a known "
+            f"T_base_frame"
+        )
 
     @property
     def locates_frame(self) -> bool:
@@ -363,13 +363,16 @@ class Position(TargetKind):
         """
         if not self.is_of_base or self.places is None or "frame" not in self.unknown:
             return False
-        return len(self.places) > 2 and not _are_collinear(self.places)
+        return len(self.places) > 2 and not bool(_are_collinear(self.places))
 
 
-def _are_collinear(points: FloatArray) -> bool:
-    """Return whether points (q, 3) are on a line."""
-    extent = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
-    return bool(extent[1] <= FLATNESS * extent[0])
+def _are_collinear(points: FloatArray) -> BoolArray:
+    """Return whether points (.., q, 3) are on a line, NaN where missing."""
+    is_there = ~np.isnan(points).any(axis=-1, keepdims=True)
+    present, count = np.where(is_there, points, 0.0), is_there.sum(axis=-2, keepdims=True)
+    middle = present.sum(axis=-2, keepdims=True) / np.maximum(count, 1)
+    extent = np.linalg.svd(np.where(is_there, points - middle, 0.0), compute_uv=False)
+    return np.asarray(extent[..., 1] <= FLATNESS * extent[..., 0])
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
