@@ -174,6 +174,39 @@ def test_loops_that_stay_open_agree(text: str, tmp_path: Path) -> None:
     assert compile_and_run(export_text(robot), tmp_path).startswith("50 poses, 0 failed")
 
 
+TENDONS = """format: 1
+family: limbs
+name: tendons
+units: {length: m, angle: rad}
+freedoms: [x, y, rz]
+controlled: [x, y]
+drives:
+  t1: {reads: length, sigma: 1e-5, radius: {q1: 0.02}}
+  t2: {reads: length, sigma: 3e-5, radius: {q1: -0.018, q2: 0.015}, unknown: [radius.q2], radii: {sd: 1e-4}}
+  t3: {reads: length, sigma: 1e-5, radius: {q1: -0.017, q2: -0.016}}
+limbs:
+  - name: arm
+    ending: rigid
+    chain:
+      - {joint: R, name: a, axis: z, actuated: q1, start: 0.3}
+      - {joint: R, name: b, at: [0.3, 0, 0], axis: z, actuated: q2, start: 1}
+    tip: [0.25, 0, 0]
+home: {x: 0.33, y: 0.34, yaw: 1.4}
+workspace: {x: [0.25, 0.4], y: [0.25, 0.4]}
+"""  # noqa: E501
+
+
+def test_redundant_sums_agree_where_readings_contradict_each_other(tmp_path: Path) -> None:
+    robot = draw_machine(load_text(tmp_path, TENDONS))
+    assert compile_and_run(export_text(robot), tmp_path).startswith("50 poses, 0 failed")
+    library = Library(fill_template(robot, []), tmp_path)
+    q = lc.inverse(robot, robot.home[None]).q[0] + [2e-4, -1e-4, 3e-4]
+    wanted = lc.forward(robot, q[None])
+    status, reached = library.call("forward", q, 12)
+    assert (status, wanted.residual[0] > 1e-5) == (0, True)
+    assert np.abs(reached[9:] - wanted.T[0, :3, 3]).max() < 1e-9
+
+
 def test_a_stage_after_loops_that_stay_open_is_closed(tmp_path: Path) -> None:
     """The wrist of a Tricept on the head of an Exechon machine."""
     shipped = (Path(lc.__file__).parent / "robots" / "tricept.yaml").read_text("utf-8")

@@ -21,6 +21,7 @@ from loopcal.engine.program import BASE, LENGTH, PITCH
 from loopcal.errors import DataError, MechanismError
 from loopcal.findings import Finding, report_finding
 from loopcal.io.formats.program_format import Exported, ExportSource, Format
+from loopcal.mechanism.actuation import measure_sums
 from loopcal.mechanism.chains import list_carrying_stages
 from loopcal.mechanism.inverse import determine_platform, measure_spans, moves_by_drives
 from loopcal.mechanism.model import Mechanism, Stage
@@ -243,7 +244,9 @@ def _write_tables(
     of_drive = [next(i for i, j in enumerate(joints) if j.drive == d) for d in range(drives)]
     names = robot.controlled
     programs = [stage.robot.program for stage in robot.blocks]
-    stays_open = any(program.may_stay_open for program in programs)
+    stays_open, trust = any(p.may_stay_open for p in programs), np.ones(len(weights))
+    if robot.has_redundant_sums:
+        stays_open, trust = False, measure_sums(robot, weights[None])
     is_given = len(robot.blocks) == 1 and determine_platform(robot) and not moves_by_drives(robot)
     is_given &= not stays_open
     closure, fixed = (
@@ -275,7 +278,7 @@ def _write_tables(
         "HAS_SUMS": any(stage.robot.has_sums for stage in robot.blocks),
         "HAS_SPARE_DRIVES": has_spare,
         "STAYS_OPEN": stays_open,
-        "MAY_STAY_OPEN": stays_open or any(p.sigma is not None for p in programs),
+        "MAY_STAY_OPEN": any(p.may_stay_open or p.sigma is not None for p in programs),
         "PLATFORM_IS_GIVEN": is_given,
         "PLACE_OF_PHI": names.index("phi") if "phi" in names else 0,
         "PLACE_OF_THETA": names.index("theta") if "theta" in names else 0,
@@ -295,6 +298,7 @@ def _write_tables(
         _table("int JOINT_OF_DRIVE[DRIVES]", of_drive),
         _table("double SPAN[DRIVES]", spans),
         _table("double WEIGHT[SUMS][DRIVES]", weights),
+        _table("double TRUST[SUMS]", trust),
         _table("struct transmission TRANSMISSION[SUMS]", tables.sums),
         _table("struct stage STAGE[STAGES]", tables.stages),
         _table("kinematics_state HOME", home),
@@ -469,7 +473,7 @@ def _choose_agreement(robot: Mechanism) -> float:
     """Return the largest accepted difference of derivatives, of the largest one: rounding; where
     loops stay open that of differences; with open sums loopcal neglects gaps over the size.
     """
-    stages = [stage.robot for stage in robot.blocks]
+    stages = [] if robot.has_redundant_sums else [stage.robot for stage in robot.blocks]
     if any(stage.program.may_stay_open and stage.has_open_sums for stage in stages):
         return 1e-2
     return 1e-6 if any(stage.program.may_stay_open for stage in stages) else 1e-9

@@ -652,10 +652,10 @@ static void write_equations(struct equations *e, const kinematics_state *s, stru
             continue;
         e->row[e->rows][COLUMNS] = goal.task == INVERSE ? -TRANSMISSION[i].fixed : -goal.value[i];
         for (j = 0; j < DRIVES; j++) {
-            e->row[e->rows][e->of_drive[j]] = TIGHT * WEIGHT[i][j];
+            e->row[e->rows][e->of_drive[j]] = TIGHT * TRUST[i] * WEIGHT[i][j];
             e->row[e->rows][COLUMNS] += WEIGHT[i][j] * s->joint[JOINT_OF_DRIVE[j]];
         }
-        e->row[e->rows][COLUMNS] *= TIGHT;
+        e->row[e->rows][COLUMNS] *= TIGHT * TRUST[i];
         e->rows++;
     }
     if (goal.task == INVERSE && !PLATFORM_IS_GIVEN) {
@@ -1016,7 +1016,7 @@ int kinematics_jacobian(const kinematics_state *s, double by_reading[6][KINEMATI
         const struct transmission *t = &TRANSMISSION[i];
         if (t->reading >= 0)
             e.row[first + i][n + t->reading] =
-                TIGHT * differentiate_sum(i, sums[i], find_reading(i, sums[i], t->begin));
+                TIGHT * TRUST[i] * differentiate_sum(i, sums[i], find_reading(i, sums[i], t->begin));
     }
     triangularize(e.row, e.rows, n, n + KINEMATICS_READINGS);
     place_stages(s, base, platform);
