@@ -78,6 +78,19 @@ def move_board(rows, T):
     return replace(rows, measured=rows.measured + later * (after - before)[0])
 
 
+def move_machine(rows, T, shutter=0.02):
+    """Move the platform of pose 7 at 15 mm/s while a rolling shutter reads 3000 rows."""
+    other, zero = replace(rows.kind, unknown=()), np.zeros((1, len(rows), 2))
+    measured, own = np.array(rows.measured), rows.rows == 6
+    for _ in range(3):  # the time at which a row is read depends on where the corner is
+        time = shutter * measured[:, 2] / 3000
+        twist = time[:, None] * np.array([0.02, 0.03, 0.01, 0.013, -0.007, 0.003])
+        moved = geometry.apply_twist(T[rows.rows], twist)
+        seen = other.measure(moved[None], zero)[0] - other.measure(T[rows.rows][None], zero)[0]
+        measured[own, 1:] = rows.measured[own, 1:] + seen[own, 1:]
+    return replace(rows, measured=measured)
+
+
 def shrink_print(rows, _):
     """State squares that are larger than the printed ones."""
     return replace(rows, kind=replace(rows.kind, square=0.02 / 0.97))
@@ -89,6 +102,14 @@ def test_picture_with_another_focal_length_is_named_with_its_zoom() -> None:
     assert (causes[0].source, causes[0].name) == ("zoomed-picture", "7")
     assert sizes[0].code == "residuals.zoomed-picture"
     assert sizes[0].data["zoom"] == pytest.approx(1.0, abs=0.05)  # [%]
+
+
+@pytest.mark.slow
+def test_picture_of_a_moving_machine_is_named() -> None:
+    causes, sizes = explain(*change(move_machine))
+    assert (causes[0].source, causes[0].name) == ("moving-picture", "7")
+    # 0.3 mm in 20 ms at 0.5 m, with 4000 px of focal length
+    assert 1.0 < sizes[0].data["motion"] < 4.0
 
 
 @pytest.mark.slow

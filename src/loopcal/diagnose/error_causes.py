@@ -17,10 +17,11 @@ with their derivatives by the readings as columns, which are zero but for those 
 (`numerics.statistics.Remainder`). Backlash is an error of the sign of travel from the pose before:
 a linear effect, see `residual_patterns`.
 
-Errors of pictures of a board are a board that moved, a picture with another focal length, a board
-that is printed at another scale, and a picture of another pose. Each is a cause of few sizes: six
-of a board from a pose on, zoom and center of a picture, the two scales of a print. They are
-compared with errors of any size in all corners of a picture. See docs/theory/camera.md.
+Errors of pictures of a board are a board that moved, a picture with another focal length or of a
+moving machine, a board that is printed at another scale, and a picture of another pose. Each is a
+cause of few sizes: six of a board from a pose on, zoom and center of a picture, its motion from row
+to row, the two scales of a print. They compete with errors of any size in all
+its corners. See docs/theory/camera.md.
 Sources: Patterson and Thompson, Recovery of inter-block information when block sizes are unequal,
 Biometrika 58 (1971); docs/theory/residual-patterns.md.
 """
@@ -79,7 +80,7 @@ from loopcal.numerics.statistics import (
 from loopcal.typing import FloatArray, IntArray
 from loopcal.units import Dimension
 
-MOVED, ZOOMED = "moved-board", "zoomed-picture"
+MOVED, ZOOMED, MOVING = "moved-board", "zoomed-picture", "moving-picture"
 CHANGING = ("board", "focal", "center")  # items of a kind that these errors change
 STEPS = 24  # poses, evenly chosen, from which on a board may be elsewhere
 CLEAR, LEAST = 6.0, 0.002  # standard deviations, and size, from which a scale is named
@@ -90,10 +91,10 @@ SIZES = (("rotation", Dimension.ANGLE), ("position", Dimension.LENGTH))
 
 def list_picture_effects(linear: FitLinearization, rows: ResidualRows) -> list[Effect]:
     """Return the effects of errors of pictures on the whitened rows; none without pictures."""
-    slopes: dict[str, FloatArray] = {}  # board -> (R, 9) by pose, zoom and center
+    slopes: dict[str, FloatArray] = {}  # board -> (R, 11), see `_linearize_pictures`
     for number, kind, of_kind in _linearize_pictures(linear):
         own = np.flatnonzero(rows.kind == number)
-        columns = slopes.setdefault(kind.board, np.zeros((len(rows.residual), 9)))
+        columns = slopes.setdefault(kind.board, np.zeros((len(rows.residual), 11)))
         columns[own] = of_kind[rows.row[own], rows.column[own]]
     if not slopes:
         return []
@@ -106,15 +107,18 @@ def list_picture_effects(linear: FitLinearization, rows: ResidualRows) -> list[E
             effects.append(Effect(MOVED, f"{board}, {labels[k]}", later, of_pose))
     every = np.sum(list(slopes.values()), axis=0)
     of_lens = (("zoom", Dimension.RATIO), *[("center", Dimension.PIXEL)] * 2)
+    of_motion = of_lens[1:] + (("motion", Dimension.PIXEL),) * 2  # a shift, and more by each row
     for k in seen:
-        of_picture = (pose == k)[:, None] * every[:, 6:]
-        effects.append(Effect(ZOOMED, labels[k], of_picture, of_lens))
+        of_picture = (pose == k)[:, None] * every
+        effects.append(Effect(ZOOMED, labels[k], of_picture[:, 6:9], of_lens))
+        effects.append(Effect(MOVING, labels[k], of_picture[:, 7:], of_motion))
     return effects
 
 
 def _linearize_pictures(linear: FitLinearization) -> Iterator[tuple[int, Image, FloatArray]]:
-    """Yield number, kind and whitened derivatives (r, 2, 9) of the rows of pictures by the pose of
-    the board, a zoom and the center, at the fit.
+    """Yield number, kind and whitened derivatives (r, 2, 11) of the rows of pictures by the pose of
+    the board, a zoom, the center, and a motion [px] from the first to the last row of a picture
+    that a rolling shutter reads row by row, at the fit.
     """
     poses, nuisance = linear.solution.linearized, linear.solution.nuisance
     if poses is None:
@@ -141,7 +145,8 @@ def _linearize_pictures(linear: FitLinearization) -> Iterator[tuple[int, Image, 
         by_board, by_focal, by_center = (other.item_values(derivative, n) for n in CHANGING)
         focal = other.item_values(values[0], "focal")[:, None]
         zoom = (by_focal * focal).sum(axis=-1, keepdims=True)
-        columns = np.concatenate([by_board, zoom, by_center], axis=-1)
+        height = rows.measured[0, :, 2, None, None] / kind.size[1] - 0.5
+        columns = np.concatenate([by_board, zoom, by_center, height * np.eye(2)], axis=-1)
         yield number, kind, rows.whiten_columns(rows.whitener[:1], columns[None])[0]
 
 
@@ -150,7 +155,7 @@ def measure_picture_errors(
 ) -> list[Finding]:
     """Return the sizes of the errors of pictures that are among the causes of residuals."""
     rows = explained.rows
-    causes = [c for c in explained.causes if c.source in (MOVED, ZOOMED)]
+    causes = [c for c in explained.causes if c.source in (MOVED, ZOOMED, MOVING)]
     return [] if rows is None else [_measure(linear, rows, cause) for cause in causes]
 
 
@@ -170,8 +175,12 @@ def _measure(linear: FitLinearization, rows: ResidualRows, cause: Cause) -> Find
         shown = {"turn": robot.to_quantity(turn, Dimension.ANGLE)}
         shown["shift"] = robot.to_quantity(shift, Dimension.LENGTH)
         return report_finding("residuals.board-moved", board=board, pose=pose, **shown, **shared)
+    shared["pose"] = cause.name
+    if cause.source == MOVING:
+        motion = float(np.linalg.norm(size[2:]))
+        return report_finding("residuals.moving-picture", motion=motion, **shared)
     zoom = 100.0 * float(size[0])
-    return report_finding("residuals.zoomed-picture", pose=cause.name, zoom=zoom, **shared)
+    return report_finding("residuals.zoomed-picture", zoom=zoom, **shared)
 
 
 def find_print_scale(fit: Identification, data: Measurements) -> list[Finding]:

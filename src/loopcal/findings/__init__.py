@@ -104,7 +104,8 @@ gates.poses-unreachable gates.errors-grew
 noise.residuals-too-large residuals.frame-moved residuals.base-targets-moved
 conformity.fails gates.limit-exceeded gates.limit-not-measured conformity.undecided
 outliers.all-poses outliers.some outliers.pose outliers.ambiguous outliers.search-not-converged
-outliers.swapped-picture residuals.print-scale residuals.zoomed-picture residuals.board-moved
+outliers.swapped-picture residuals.print-scale residuals.zoomed-picture residuals.moving-picture
+residuals.board-moved
 outliers.conflict
 workflow.no-held-out-poses workflow.few-held-out-poses workflow.held-out-setup
 workflow.undetermined-combinations validation.setup-moved

@@ -250,6 +250,7 @@ CAUSES = {
     "backlash": "backlash",
     "moved-board": "a board that moved",
     "zoomed-picture": "a picture with another focal length",
+    "moving-picture": "a picture of a moving machine",
 }
 """What may cause residuals."""
 
@@ -257,6 +258,7 @@ NAMED_CAUSES = {
     "temperature": "the temperature {name}",
     "reading": "a dependence on the reading {name}",
     "zoomed-picture": "the picture of pose {name}, which has another focal length",
+    "moving-picture": "the picture of pose {name}, during which the machine moved",
 }
 """Those of them of which a finding states the name."""
 
