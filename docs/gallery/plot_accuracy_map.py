@@ -8,11 +8,10 @@ its workspace only, because the camera sees no more. The accuracy map shows what
 edge, and the budget shows what to improve.
 """
 
-# sphinx_gallery_thumbnail_path = "docs/pictures/thumbnails/accuracy_map.png"
-
 # %%
 # Thirty poses in the inner part, measured with a camera: x and y to 20 um, yaw to 0.01 degrees.
 
+# sphinx_gallery_thumbnail_path = "docs/pictures/thumbnails/accuracy_map.png"
 import numpy as np
 
 import loopcal as lc

@@ -8,12 +8,11 @@ and a ball on the platform. It is cheap, and many workshops have one. With the t
 places it determines everything about this hexapod but where its frames are.
 """
 
-# sphinx_gallery_thumbnail_path = "docs/pictures/thumbnails/ball_bar.png"
-
 # %%
 # The three places of the table ball are three sessions, each with an unknown place of its own.
 # The ball on the platform is not known exactly either.
 
+# sphinx_gallery_thumbnail_path = "docs/pictures/thumbnails/ball_bar.png"
 import numpy as np
 
 import loopcal as lc

@@ -8,13 +8,12 @@ must agree in every pose, although nobody measured where the point is. This exam
 the robot these angles determine, and what a few measured positions add.
 """
 
-# sphinx_gallery_thumbnail_path = "docs/pictures/thumbnails/cable_readings.png"
-
 # %%
 # Each line has its anchor and a length. The file states ``sigma`` of every motor, so that the
 # poses are unknowns of the fit: four angles for three coordinates leave one equation for each
 # pose.
 
+# sphinx_gallery_thumbnail_path = "docs/pictures/thumbnails/cable_readings.png"
 import numpy as np
 
 import loopcal as lc

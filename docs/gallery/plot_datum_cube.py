@@ -8,13 +8,12 @@ somewhere on the table. The cube's faces are flat and perpendicular, and its edg
 from a certificate; where it lies is unknown. Here a hexapod probes five faces.
 """
 
-# sphinx_gallery_thumbnail_path = "docs/pictures/thumbnails/datum_cube.png"
-
 # %%
 # Each face is a plane in the frame of the cube. All five share this unknown frame. Opposite faces
 # are 80 mm apart, as the certificate says, so they determine the scale. The probe repeats to 1
 # um.
 
+# sphinx_gallery_thumbnail_path = "docs/pictures/thumbnails/datum_cube.png"
 import numpy as np
 
 import loopcal as lc

@@ -8,12 +8,11 @@ leveled it: its height and its two tilts are unknown. This example shows what th
 what it leaves open, and which cheap measurement closes the gap.
 """
 
-# sphinx_gallery_thumbnail_path = "docs/pictures/thumbnails/dial_gauge.png"
-
 # %%
 # A gauge that reads the gap between the tool and a plane is the measurement kind ``Plane``. It
 # has a standard deviation of 3 um. The plate is probed at 36 points.
 
+# sphinx_gallery_thumbnail_path = "docs/pictures/thumbnails/dial_gauge.png"
 import numpy as np
 
 import loopcal as lc

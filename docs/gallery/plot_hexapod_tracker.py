@@ -10,12 +10,11 @@ beside the 42 numbers of the hexapod: joint centers and leg lengths.
 The machine is simulated, so the result can be compared with the truth.
 """
 
-# sphinx_gallery_thumbnail_path = "docs/pictures/thumbnails/hexapod_tracker.png"
-
 # %%
 # The robot file states the drawing and its tolerances. The true machine deviates from the
 # drawing; here its errors are drawn from the tolerances.
 
+# sphinx_gallery_thumbnail_path = "docs/pictures/thumbnails/hexapod_tracker.png"
 import numpy as np
 
 import loopcal as lc

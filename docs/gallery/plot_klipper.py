@@ -8,12 +8,11 @@ this file, finds the numbers that make the bed flat, says how certain they are, 
 a copy of the file. The commands need no Python; here Python simulates the printer and draws.
 """
 
-# sphinx_gallery_thumbnail_path = "docs/pictures/thumbnails/klipper.png"
-
 # %%
 # The true printer: its radius is 0.7 mm larger than printer.cfg says, a tower is turned by 0.2
 # degrees, and two end stops are off.
 
+# sphinx_gallery_thumbnail_path = "docs/pictures/thumbnails/klipper.png"
 import shlex
 import subprocess
 import sys

@@ -8,11 +8,10 @@ ways, from little to much of your own: a loss for outliers, a rule that chooses 
 or a complete estimator with scipy, for which loopcal supplies poses and derivatives.
 """
 
-# sphinx_gallery_thumbnail_path = "docs/pictures/thumbnails/own_estimator.png"
-
 # %%
 # The data: a five-bar robot, 40 measured positions, and three of them wrong by 0.3 mm.
 
+# sphinx_gallery_thumbnail_path = "docs/pictures/thumbnails/own_estimator.png"
 from dataclasses import replace
 
 import numpy as np

@@ -8,13 +8,12 @@ has a model of it. Its description takes thirty lines: chains of joints and how 
 this loopcal derives kinematics, parameters and calibration, without a line of code.
 """
 
-# sphinx_gallery_thumbnail_path = "docs/pictures/thumbnails/own_mechanism.png"
-
 # %%
 # Two slides run along x at y = 0 and y = 300 mm. Each pushes a rod, and both rods meet in the
 # pen. ``errors`` and ``unknown`` name what may differ from the drawing: where each slide is, how
 # far it is tilted, how long its rod is, and the zero and the scale of each drive.
 
+# sphinx_gallery_thumbnail_path = "docs/pictures/thumbnails/own_mechanism.png"
 import tempfile
 from dataclasses import replace
 from pathlib import Path

@@ -8,11 +8,10 @@ accuracy with fewer measurements than poses spread evenly. A plan states how far
 possible choice, and leaves some poses for validation.
 """
 
-# sphinx_gallery_thumbnail_path = "docs/pictures/thumbnails/planning.png"
-
 # %%
 # The instrument: a tracker with one reflector, 15 mm above the platform of a 3-PRS tripod head.
 
+# sphinx_gallery_thumbnail_path = "docs/pictures/thumbnails/planning.png"
 import numpy as np
 
 import loopcal as lc

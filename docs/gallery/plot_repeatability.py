@@ -8,12 +8,11 @@ for five poses and thirty visits of each. A tracker measures the position of the
 computes both, each with the interval that thirty visits leave.
 """
 
-# sphinx_gallery_thumbnail_path = "docs/pictures/thumbnails/repeatability.png"
-
 # %%
 # The simulated delta robot scatters by 10 um in x, y and z, and its geometry has errors of the
 # size of its tolerances. The tracker is five times better than the scatter, as the standard asks.
 
+# sphinx_gallery_thumbnail_path = "docs/pictures/thumbnails/repeatability.png"
 import numpy as np
 
 import loopcal as lc

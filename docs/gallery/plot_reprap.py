@@ -8,12 +8,11 @@ of a bed do not determine them. This example shows that from the heights of one 
 what heights do determine, and adds two distances on a printed part for the size of parts.
 """
 
-# sphinx_gallery_thumbnail_path = "docs/pictures/thumbnails/reprap.png"
-
 # %%
 # The true printer: all three rods are 0.3 mm longer than the firmware believes, and the radius is
 # 0.6 mm larger. The firmware probes sixteen points; the probe repeats to 0.02 mm.
 
+# sphinx_gallery_thumbnail_path = "docs/pictures/thumbnails/reprap.png"
 import shlex
 import subprocess
 import sys

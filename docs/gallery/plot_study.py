@@ -8,12 +8,11 @@ calibrates each of them, and compares the result with the truth. This one takes 
 how many points a delta robot needs with a cheap and with a good camera.
 """
 
-# sphinx_gallery_thumbnail_path = "docs/pictures/thumbnails/study.png"
-
 # %%
 # A study is a file. Each combination of its levels is a cell, here four numbers of points times
 # two cameras, with 100 machines in each.
 
+# sphinx_gallery_thumbnail_path = "docs/pictures/thumbnails/study.png"
 import tempfile
 from pathlib import Path
 

@@ -9,11 +9,10 @@ gravity relative to the base are unknowns. Angles alone cannot determine lengths
 adds the height.
 """
 
-# sphinx_gallery_thumbnail_path = "docs/pictures/thumbnails/tilt_meter.png"
-
 # %%
 # The level has a standard deviation of 5 urad, the gauge one of 2 um.
 
+# sphinx_gallery_thumbnail_path = "docs/pictures/thumbnails/tilt_meter.png"
 import numpy as np
 
 import loopcal as lc

@@ -8,11 +8,10 @@ Both calibrations differ in all 42 numbers, because both have noise. Comparing t
 the machine itself has changed, and where.
 """
 
-# sphinx_gallery_thumbnail_path = "docs/pictures/thumbnails/two_sessions.png"
-
 # %%
 # Both sessions use a six-degree-of-freedom tracker: 5 um and 20 urad.
 
+# sphinx_gallery_thumbnail_path = "docs/pictures/thumbnails/two_sessions.png"
 import tempfile
 from pathlib import Path
 
@@ -58,4 +57,5 @@ error = (shift - 0.06) / sd
 print(f"{moved}: {shift:+.3f} {row.unit} (k = 1: {sd:.3f}), error {error:+.1f} sd")
 
 cause = comparison.pairs[0]
-print(f"the cause alone: {1e3 * cause.cause_shift[0]:+.4f} +/- {1e3 * cause.cause_sd[0]:.4f} mm")
+shift, sd = 1e3 * cause.cause_shift[0], 1e3 * cause.cause_sd[0]
+print(f"the cause alone: {shift:+.4f} mm (k = 1: {sd:.4f})")
