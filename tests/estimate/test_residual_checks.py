@@ -122,6 +122,9 @@ def test_calibration_with_a_coarse_instrument_is_not_worthwhile():
     fine = estimate_calibration_gain(identify(hexapod(), good), good)
     assert fine.is_worthwhile
     assert fine.position_after < 0.1 * fine.position_before
+    for name in ("position", "orientation"):  # both sizes are in one unit
+        assert len({size.unit for size in fine.finding.data[name]}) == 1
+        assert len({str(size).split()[1] for size in fine.finding.data[name]}) == 1
     for method in (None, LeastSquares()):
         useless = estimate_calibration_gain(identify(hexapod(), poor, method), poor)
         assert useless.is_worthwhile is False

@@ -35,7 +35,7 @@ from loopcal.estimate.identification import identify
 from loopcal.estimate.penalties import LeastSquares
 from loopcal.estimate.residual_test import FEWEST_DEGREES, SIGNIFICANCE
 from loopcal.estimate.result import Identification
-from loopcal.findings import Finding, report_finding
+from loopcal.findings import Finding, Quantity, report_finding
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations
 from loopcal.mechanism.model import Mechanism
@@ -43,6 +43,7 @@ from loopcal.mechanism.transmission import SOURCE, find_fixed_rows, transmit_rea
 from loopcal.numerics.statistics import compute_f_tail, find_distinct
 from loopcal.results.description import Field, fields
 from loopcal.results.result import Result
+from loopcal.results.tables import choose_unit
 from loopcal.typing import Progress, report_no_progress
 from loopcal.units import Dimension
 
@@ -148,9 +149,12 @@ def estimate_calibration_gain(
     )
     pairs = {Dimension.LENGTH: positions, Dimension.ANGLE: angles}
     is_worthwhile = any(before > GAIN * after for before, after in pairs.values() if before > 0.0)
+    units = {d: choose_unit(fit.robot.get_unit(d), [min(pair)]) for d, pair in pairs.items()}
     position, orientation = (
-        tuple(fit.robot.to_quantity(size, dimension) for size in pair) if pair[0] > 0.0 else None
-        for dimension, pair in pairs.items()
+        tuple(Quantity(size / unit.factor_to_si, unit.symbol) for size in pairs[dimension])
+        if pairs[dimension][0] > 0.0
+        else None
+        for dimension, unit in units.items()
     )
     finding = report_finding(
         "model.expected-gain" if is_worthwhile else "model.no-expected-gain",
