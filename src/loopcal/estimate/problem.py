@@ -569,12 +569,15 @@ def _compute_whiteners(sensor: Sensor, measured: FloatArray) -> FloatArray:
     kind, step = sensor.kind, max(1, BLOCK // max(1, measured.shape[1]))
     batches = [measured[first : first + step] for first in range(0, len(measured), step)]
     first = _list_noise(kind, batches[0][:1])
-    if all(_is_equal(_list_noise(kind, batch), first) for batch in batches):
+    sight = sensor.noise.sight
+    if not sight and all(_is_equal(_list_noise(kind, batch), first) for batch in batches):
         batches = [batches[0][:1]]
     white = []
     for batch in batches:  # so that what they are computed with stays small
         N, present = _list_noise(kind, batch)
         covariance = (N * np.asarray(sensor.noise.sigma) ** 2) @ np.swapaxes(N, -1, -2)
+        spread = kind.spread_sight_noise(batch) if sight else {}
+        covariance = sum((sd * sd * spread[name] for name, sd in sight.items()), covariance)
         t, r, m = present.shape
         flat = np.broadcast_to(covariance, (t, r, m, m)).reshape(-1, m, m)
         whitener = compute_whitener(flat, present.reshape(-1, m), np.ones(t * r))

@@ -4,7 +4,9 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from types import MappingProxyType
 from typing import Literal, Self
 
 import numpy as np
@@ -30,7 +32,12 @@ SIGMA = {Dimension.LENGTH: 1e-5, Dimension.ANGLE: 5e-5, Dimension.RATIO: 5e-5, D
 
 
 class Noise(ABC):
-    """Independent noise of m columns."""
+    """Independent noise of m columns.
+
+    sight : name -> standard deviation [SI] of noise by `Kind.sight_noise`, in addition.
+    """
+
+    sight: Mapping[str, float] = MappingProxyType({})
 
     @property
     @abstractmethod
@@ -55,15 +62,24 @@ def _check_positive(value: ArrayLike, what: str) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class Gaussian(Noise):
-    """Normal noise with standard deviations `sd` (m,) [SI]; DataError unless each is above 0."""
+    """Normal noise with standard deviations `sd` (m,) [SI]; DataError unless each is above 0.
+
+    sight : standard deviations [SI] of a tracker in addition, such as
+        `{"range": 6e-6, "angle": 5e-6}`; `sd` may then be 0.
+    """
 
     sd: FloatArray
+    sight: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        set_fields(self, sd=_check_positive(self.sd, "the sigma of the noise"))
+        what = "the sigma of the noise"
+        sd = check_array(self.sd, what, (None,))
+        stated = [*self.sight.values(), *sd[sd != 0.0]] if self.sight else sd
+        _check_positive(stated, what)
+        set_fields(self, sd=sd)
 
     def __repr__(self) -> str:
-        return f"Gaussian({self.sd.tolist()})"
+        return f"Gaussian({self.sd.tolist()}{f', {dict(self.sight)}' if self.sight else ''})"
 
     @property
     def sigma(self) -> FloatArray:

@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from datetime import date
+from types import MappingProxyType
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -335,6 +336,7 @@ class Observations:
         sigma: ArrayLike,
         session: str | TextArray = "",
         group: str | TextArray = "",
+        sight: Mapping[str, float] = MappingProxyType({}),
     ) -> Self:
         """Return rows with independent noise of the kind's noise columns.
 
@@ -345,6 +347,7 @@ class Observations:
         rows : (r,) int. measured : (r, c) [SI].
         sigma : standard deviations [SI]: a number, (m,) or (r, m); DataError unless above 0.
         session, group : text or (r,) text.
+        sight : name -> standard deviation [SI] of noise by `Kind.sight_noise`, in addition.
         """
         check_type(kind, Kind, "kind", "such as loopcal.Pose()")
         values = check_measured(measured, kind)
@@ -356,8 +359,14 @@ class Observations:
             raise DataError(f"sigma contains {wrong[0]:.6g}. Give numbers above 0, {SD_RANGE}")
         N, sd = drop_repeats(kind.linearize_noise(values)), drop_repeats(sd)
         covariance = (N * (sd * sd)[:, None, :]) @ np.swapaxes(N, -1, -2)
-        of_session, of_group = np.asarray(session), np.asarray(group)
-        return cls(kind, np.asarray(rows), values, covariance, session=of_session, group=of_group)
+        names: Any = {"session": np.asarray(session), "group": np.asarray(group)}
+        spread = kind.spread_sight_noise(values) if sight else {}
+        parts = tuple(
+            NoisePart(n, sd * sd * spread[n], find_size(np.array([sd]), [kind.sight_noise[n]]))
+            for n, sd in sight.items()
+        )
+        covariance = sum((part.covariance for part in parts), covariance)
+        return cls(kind, np.asarray(rows), values, covariance, noise_parts=parts, **names)
 
     def __len__(self) -> int:
         return len(self.rows)

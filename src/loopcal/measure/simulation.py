@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import get_args
 
 import numpy as np
@@ -156,7 +157,8 @@ class Trials:
         """Return the measurements of one trial."""
         observations = [
             Observations.from_sigma(
-                s.kind, s.assigned_rows, measured[i], s.noise.sigma, s.session, s.group
+                *(s.kind, s.assigned_rows, measured[i], s.noise.sigma, s.session, s.group),
+                sight=s.noise.sight,
             )
             for s, measured in zip(self.instrument.sensors, self.measured, strict=True)
         ]
@@ -278,7 +280,12 @@ def simulate_trials(
         kind, rows = sensor.kind, sensor.assigned_rows
         noise = np.stack([sensor.noise.draw(stream, len(rows)) for stream in streams])
         setup = nuisance.select(k, true_setup)
-        columns = kind.measure(seen[:, rows], noise, setup, kind.stack_joints(joints, rows))
+        measure = partial(kind.measure, seen[:, rows], nuisance=setup)
+        measure = partial(measure, joints=kind.stack_joints(joints, rows))
+        if sight := sensor.noise.sight:
+            spread = kind.spread_sight_noise(measure(np.zeros_like(noise)))
+            noise = noise + _draw_sight_noise(sight, spread, streams)
+        columns = measure(noise)
         columns = kind.hide_unseen(seen[:, rows], columns, setup)
         if kind.label_count and not kind.detect_present(columns).any():
             raise DataError(
@@ -304,6 +311,21 @@ def simulate_trials(
     recorded = _record_readings(robot, shown, reading_sigma, len(values), seed)
     columns = tuple(measured)
     return Trials(assigned, robot.name, readings, columns, values, T, reached, nuisance, *recorded)
+
+
+def _draw_sight_noise(
+    sight: Mapping[str, float],
+    spread: Mapping[str, FloatArray],
+    streams: Sequence[np.random.Generator],
+) -> FloatArray:
+    """Return noise (t, r, m) [SI] of these covariances (t, r, m, m) per variance of each source."""
+    noise = np.zeros(())
+    for name, sd in sight.items():
+        roots = np.linalg.eigh(spread[name])  # no source has full rank
+        axes = roots.eigenvectors * np.sqrt(np.maximum(roots.eigenvalues, 0.0))[..., None, :]
+        drawn = np.stack([stream.standard_normal(axes.shape[1:3]) for stream in streams])
+        noise = noise + sd * np.einsum("trij,trj->tri", axes, drawn)
+    return noise
 
 
 def _draw_conditions(robot: Mechanism, readings: FloatArray, seed: Seed) -> FloatArray:

@@ -300,7 +300,9 @@ def _linearize_block(
         unusable[[row * len(members) // len(rows) for row in undefined]] = True
         measured = np.where(np.isin(np.arange(len(rows)), undefined)[:, None], np.nan, measured)
         observations.append(
-            Observations.from_sigma(kind, rows, measured, sensor.noise.sigma, "", "")
+            Observations.from_sigma(
+                kind, rows, measured, sensor.noise.sigma, sight=sensor.noise.sight
+            )
         )
     data = Measurements(robot.name, observed.readings, tuple(observations))
     columns = observed.by_frames() if by_frames else observed

@@ -70,7 +70,6 @@ from loopcal.units import (
 
 if TYPE_CHECKING:
     from loopcal.measure.kinds.kind import Kind
-    from loopcal.measure.kinds.position import Position
     from loopcal.measure.nuisance import StatedValue
     from loopcal.measure.observations import InstrumentRecord, NoisePart, Observations, StatedSize
     from loopcal.parameters import Parameter
@@ -266,6 +265,7 @@ def describe_kind(
             settings[setting.name] = _describe_setting(value, hints[setting.name])
     if noise:
         units = {column.name: NOISE_UNITS[column.dimension] for column in kind.noise_columns}
+        units |= {name: NOISE_UNITS[dimension] for name, dimension in kind.sight_noise.items()}
         # nine digits: more would be rounding
         sigmas = {name: f"{s / units[name][1]:.9g} {units[name][0]}" for name, s in noise.items()}
         if len(sigmas) > MANY_SIGMAS and len(set(sigmas.values())) == 1:
@@ -951,7 +951,7 @@ def _read_values(
     if sight := [name for name in kind.sight_noise if name in entry.noise]:
         parts = parts if covariance.any() else []
         with name_files(table.path):
-            spread = cast("Position", kind).spread_sight_noise(measured)
+            spread = kind.spread_sight_noise(measured)
         parts += [NoisePart(n, entry.noise[n] ** 2 * spread[n], entry.sizes[n]) for n in sight]
         covariance = np.sum([part.covariance for part in parts], axis=0)
     return measured, covariance, tuple(parts)

@@ -78,7 +78,7 @@ from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import get_dimension
 from loopcal.mechanism.transmission import LOAD
 from loopcal.typing import BoolArray, FloatArray
-from loopcal.units import EXAMPLES, SMALLEST_SD, find_sd_fault
+from loopcal.units import EXAMPLES, SMALLEST_SD, find_sd_fault, find_unit
 
 if TYPE_CHECKING:
     from loopcal.measure.instrument import Instrument
@@ -710,15 +710,19 @@ def _build_instrument(table: Table, kinds: Sequence[KindRows]) -> Instrument:
     _check_base_targets([(table, kinds)])
     sensors = []
     for entry in kinds:
+        sight = {n: entry.noise[n] for n in entry.kind.sight_noise if n in entry.noise}
+        if sight and np.array_equal(getattr(entry.kind, "T_base_frame", None), np.eye(4)):
+            finding = report_finding("files.instrument-place-needed")
+            raise table.settings.error(finding, (*entry.location, "noise"))
         for column in entry.kind.noise_columns:
-            if column.name not in entry.noise:
+            if not sight and column.name not in entry.noise:
                 example = f"noise: {{{column.name}: {EXAMPLES[column.dimension]}}}"
                 sentence = (
                     f"planning and simulation need the noise of {column.name!r}. Add '{example}'"
                 )
                 raise table.settings.error(sentence, (*entry.location, "noise"))
-        sigma = np.array([entry.noise[column.name] for column in entry.kind.noise_columns])
-        sensors.append(Sensor(entry.kind, Gaussian(sigma)))
+        sigma = np.array([entry.noise.get(column.name, 0.0) for column in entry.kind.noise_columns])
+        sensors.append(Sensor(entry.kind, Gaussian(sigma, sight)))
     return Instrument(tuple(sensors), read_setup_priors(table.settings, kinds))
 
 
@@ -900,12 +904,8 @@ def format_data_sheet(
             continue
         empty = np.full((len(sensor.rows), len(sensor.kind.columns)), np.nan)
         empty[:, : sensor.kind.label_count] = sensor.kind.list_labels(len(empty))
-        sigma = sensor.noise.sigma
-        rows.append(
-            Observations.from_sigma(
-                sensor.kind, sensor.rows, empty, sigma, sensor.session, sensor.group
-            )
-        )
+        names = (sensor.noise.sigma, sensor.session, sensor.group, sensor.noise.sight)
+        rows.append(Observations.from_sigma(sensor.kind, sensor.rows, empty, *names))
     readings = np.asarray(readings)
     is_empty = np.isnan(readings)
     data = Measurements(
@@ -979,14 +979,23 @@ def _tabulate_rows(
     kind = rows.kind
     names = [name_measured(column.name, robot) for column in kind.columns]
     columns = dict(zip(names, rows.measured.T, strict=True))
-    N = kind.linearize_noise(rows.measured)
-    half = np.linalg.solve(N, rows.covariance)
+    N, common = kind.linearize_noise(rows.measured), dict[str, float]()
+    left = rows.covariance
+    for part in rows.noise_parts:
+        if part.name in kind.sight_noise and (size := part.size) is not None:
+            sd = size.value * find_unit(size.unit).factor_to_si / size.divisor
+            wanted = sd * sd * kind.spread_sight_noise(rows.measured)[part.name]
+            if np.allclose(part.covariance, wanted, rtol=EQUAL, atol=0.0):
+                common[part.name], left = sd, left - part.covariance
+    left = np.where(np.abs(left) > EQUAL * np.abs(rows.covariance), left, 0.0) if common else left
+    half = np.linalg.solve(N, left)
     covariance = np.linalg.solve(N, np.swapaxes(half, -1, -2))
     sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     is_common = np.all(np.abs(sigma - sigma[:1]) <= EQUAL * sigma[:1], axis=0)
     is_related = np.any(np.abs(covariance) > EQUAL * sigma[:, :, None] * sigma[:, None, :], axis=0)
-    common = {}
     for i, column in enumerate(kind.noise_columns):
+        if common and not sigma[:, i].any():
+            continue
         if is_common[i]:
             common[column.name] = float(sigma[0, i])
         else:

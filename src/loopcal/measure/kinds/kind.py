@@ -384,6 +384,12 @@ class Kind(ABC):
         """What the noise may consist of beside that of columns, as a tracker has it."""
         return {}
 
+    def spread_sight_noise(self, measured: FloatArray) -> dict[str, FloatArray]:
+        """Return the covariances (.., m, m) of measured values (.., m) per variance of each
+        `sight_noise`.
+        """
+        return {}
+
     @cached_property
     def common_errors(self) -> Mapping[int, str]:
         """Place among the u parameters -> common error of the instrument, such as `tracker.bias`

@@ -265,7 +265,7 @@ class Position(TargetKind):
         return {"range": length, "angle": angle, "centering": length}
 
     def spread_sight_noise(self, measured: FloatArray) -> dict[str, FloatArray]:
-        """Return the covariances (r, 3 k, 3 k) of measured points (r, 3 k) per variance of each
+        """Return the covariances (.., 3 k, 3 k) of measured points (.., 3 k) per variance of each
         `sight_noise`, as an instrument at the station measures them. DataError where nothing says
         where it stands.
         """
@@ -276,14 +276,14 @@ class Position(TargetKind):
                 "base. Give `station`, as [1200 mm, 0 mm, 900 mm]"
             )
         station = np.zeros(3) if self.station is None else self.station
-        lever = np.nan_to_num(measured).reshape(len(measured), -1, 3) - station
+        lever = np.nan_to_num(measured).reshape(*measured.shape[:-1], -1, 3) - station
         length = np.maximum(np.linalg.norm(lever, axis=-1), FLATNESS)[..., None]
         along = (lever / length)[..., None] * (lever / length)[..., None, :]
         spread = {"range": along, "angle": length[..., None] ** 2 * (np.eye(3) - along)}
         spread["centering"] = np.broadcast_to(np.eye(3), along.shape)
-        shape, apart = (len(measured), measured.shape[1], measured.shape[1]), np.eye(lever.shape[1])
+        shape, apart = (*measured.shape, measured.shape[-1]), np.eye(lever.shape[-2])
         return {
-            name: np.einsum("rkij,kl->rkilj", block, apart).reshape(shape)
+            name: np.einsum("...kij,kl->...kilj", block, apart).reshape(shape)
             for name, block in spread.items()
         }
 
