@@ -24,6 +24,7 @@ AXES = ("rx", "ry", "rz", "x", "y", "z")
 TWIST_UNITS = ("rad", "rad", "rad", "m", "m", "m")
 
 BASE, PLATFORM = "base", "platform"
+ALONG = 1e-9  # component of an axis below which it is across
 """Names of the base, also of a chain of stages, and of the platform."""
 
 MOST_LIMBS, MOST_JOINTS, MOST_ACTUATORS, MOST_PARAMETERS = 100, 50, 200, 2000
@@ -236,7 +237,7 @@ class Assembly:
         all stages together, with the name of the stage before those of limbs and parameters.
     closure : of over-constrained loops, `exact` or `least-squares`.
     bodies : name -> first guess (4, 4) of the home pose in the base, of each body beside base and
-        platform that limbs join. They have the freedoms of the platform.
+        platform that limbs join.
     held : of a chain, the actuators that inverse kinematics leaves at their present readings.
     couplings : rows of driven joints beside those of actuators, without a reading of their own.
     load : on the end platform.
@@ -275,6 +276,32 @@ class Assembly:
         """The number of each body, as an engine knows it."""
         names = (BASE, PLATFORM, *self.bodies)
         return {name: number for number, name in enumerate(names, engine.BASE)}
+
+    @cached_property
+    def freedoms_of_bodies(self) -> tuple[str, ...]:
+        """Those of the platform and of the joints of rigid limbs at bodies: a crank turns, even if
+        the platform does not. Axes in the base with every joint at zero; two rotations about
+        different axes lead to a third one, and a rotation moves points of a machine that shifts.
+        """
+        at_home = {BASE: np.eye(4), PLATFORM: self.home, **self.bodies}
+        moves = np.array([axis in self.freedoms for axis in AXES])
+        for limb in self.limbs:
+            T = at_home[limb.on]
+            if limb.ending == "rigid" and not self.bodies.keys().isdisjoint((limb.on, limb.to)):
+                for link, joint in zip(limb.links, limb.joints, strict=False):
+                    T = T @ link.transform
+                    along = np.abs(T[:3, 2]) > ALONG
+                    turns = along if joint.kind == "R" else np.zeros(3, bool)
+                    across = (turns.any() & ~turns | (turns.sum() > 1)) & moves[3:].any()
+                    moves |= np.concatenate([turns, across | (along & ~turns)])
+        if moves[:3].sum() == 2:
+            moves[:] = True
+        return tuple(axis for axis, moved in zip(AXES, moves, strict=True) if moved)
+
+    def select_rows(self, limb: Limb) -> tuple[int, ...]:
+        """Return the closure rows of a limb, in the freedoms of what it joins."""
+        is_inner = not self.bodies.keys().isdisjoint((limb.on, limb.to))
+        return select_rows(limb.ending, self.freedoms_of_bodies if is_inner else self.freedoms)
 
     @cached_property
     def driven_joints(self) -> tuple[str, ...]:
@@ -351,7 +378,7 @@ def refuse_more(most: int, count: int, subject: str, noun: str) -> None:
 
 
 def select_rows(ending: str, freedoms: tuple[str, ...]) -> tuple[int, ...]:
-    """Return the rows of an ending in the platform's freedoms, such as those of a plane."""
+    """Return the rows of an ending in these freedoms, such as those of a plane."""
     if ending == "distance":
         return (0,)
     axes = AXES if ending == "rigid" else AXES[3:]

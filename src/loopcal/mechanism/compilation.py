@@ -22,7 +22,6 @@ from loopcal.mechanism.assembly import (
     Assembly,
     AttachedStage,
     Limb,
-    select_rows,
 )
 from loopcal.mechanism.chains import find_carrying_actuators, join_stage_states, locate_stage_bases
 from loopcal.mechanism.inverse import inverse_trials
@@ -152,7 +151,8 @@ def _close_at_home(
     slots = _find_slots(assembly)
     freedoms = tuple(AXES.index(f) for f in AXES if f in assembly.freedoms)
     size, a = compute_characteristic_length(assembly), len(assembly.driven_joints)
-    others = (freedoms,) * len(assembly.bodies)
+    of_bodies = tuple(AXES.index(f) for f in assembly.freedoms_of_bodies)
+    others = (of_bodies,) * len(assembly.bodies)
     groups, places, count = _group_limbs(assembly, slots, {})
     guess = _make_first_guess(assembly, groups)
     idle = find_idle_joints(Program(groups, freedoms, size, count, a, others=others), guess)
@@ -267,7 +267,7 @@ def _check_drives(assembly: Assembly, idle: Mapping[int, tuple[int, ...]]) -> No
     for i, limb in enumerate(assembly.limbs):
         joints = len(limb.joints) + bool(limb.actuator) - len(idle.get(i, ()))
         joints -= len(coupled.intersection(limb.drives))
-        equations = len(select_rows(limb.ending, assembly.freedoms))
+        equations = len(assembly.select_rows(limb))
         if limb.drives and joints > equations:
             excess = name_count(joints - equations, "joint")
             raise MechanismError(
@@ -290,12 +290,13 @@ def _group_limbs(
     for i, limb in enumerate(assembly.limbs):
         structure = tuple((j.kind, bool(j.actuator)) for j in limb.joints), bool(limb.actuator)
         ends = (min(numbers[name], 1) for name in (limb.on, limb.to))
-        alike.setdefault((limb.ending, structure, locked.get(i, ()), *ends), []).append(i)
+        shape = limb.ending, assembly.select_rows(limb), structure, locked.get(i, ()), *ends
+        alike.setdefault(shape, []).append(i)
     driven = {name: i for i, name in enumerate(assembly.driven_joints)}
     groups, places, count = [], {}, 0
-    for members in alike.values():
+    for (ending, rows, *_), members in alike.items():
         limbs, fixed = [assembly.limbs[i] for i in members], locked.get(members[0], ())
-        kinds, ending = "".join(j.kind for j in limbs[0].joints), limbs[0].ending
+        kinds = "".join(j.kind for j in limbs[0].joints)
         used = {slot for m in limbs for slot in slots_by_limb[m.name].values()}
         slots = tuple(sorted(used, key=lambda s: (s.element, s.axis)))
         column = {slot: i for i, slot in enumerate(slots)}
@@ -316,7 +317,7 @@ def _group_limbs(
                 actuators,
                 tuple(j in fixed for j in range(len(kinds))),
                 ending,
-                select_rows(ending, assembly.freedoms),
+                rows,
                 np.array(transforms),
                 pitch.reshape(len(limbs), len(kinds)),
                 np.array([m.length for m in limbs]),

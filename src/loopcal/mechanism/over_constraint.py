@@ -222,15 +222,14 @@ def _find_sufficient_freedoms(
     Those in which the platform moves, home and near it, are among them.
     """
     freedoms = robot.program.freedoms
-    used = np.zeros(len(freedoms), bool)
+    used, columns = set[int](), np.array([f for _, f in robot.program.unknown_twists])
     for rows in _linearize(robot, find_nearby_states(robot)):
         _, s, W = np.linalg.svd(np.concatenate([rows.A, rows.Q], axis=1), full_matrices=True)
-        motions = W[count_rank(s) :, : rows.A.shape[1]].reshape(-1, len(freedoms))
-        largest = np.abs(motions).max(axis=0, initial=0.0)
-        used |= largest > SAME * largest.max(initial=1e-300)
-    still = np.flatnonzero(~used)
+        largest = np.abs(W[count_rank(s) :, : rows.A.shape[1]]).max(axis=0, initial=0.0)
+        used.update(columns[largest > SAME * largest.max(initial=1e-300)].tolist())
+    still = [i for i, f in enumerate(freedoms) if f not in used]
     for left_out in range(1, len(still) + 1):
-        for dropped in combinations(still.tolist(), left_out):
+        for dropped in combinations(still, left_out):
             names = tuple(AXES[f] for i, f in enumerate(freedoms) if i not in dropped)
             narrow = replace(robot.assembly, freedoms=names, closure="exact")
             with suppress(MechanismError):
