@@ -14,15 +14,7 @@ from loopcal.engine import Group, Program, Slot, State
 from loopcal.errors import MechanismError, suggest_names
 from loopcal.findings import Finding, Quantity, report_finding
 from loopcal.findings.wording import name_count
-from loopcal.mechanism.assembly import (
-    AXES,
-    BASE,
-    PLATFORM,
-    Address,
-    Assembly,
-    AttachedStage,
-    Limb,
-)
+from loopcal.mechanism.assembly import AXES, BASE, PLATFORM, Address, Assembly, AttachedStage, Limb
 from loopcal.mechanism.chains import find_carrying_actuators, join_stage_states, locate_stage_bases
 from loopcal.mechanism.inverse import inverse_trials
 from loopcal.mechanism.kinematics import compute_closure_sign, forward_trials, solve_serial
@@ -569,7 +561,7 @@ def _check_chain(robot: Mechanism, home: State) -> None:
     _, tau = robot.slots(values)
     q = readings_from_joints(driven_values(robot.program, home), tau, robot.slots.constants)
     D = differentiate_pose(robot, values, q, home).readings[0, 0][:, moving]
-    scaled = D * robot.twist_scale[:, None] / robot.reading_units[moving]
+    scaled = D * robot.twist_scale[:, None] / robot.drive_units[moving]
     freedoms = count_rank(np.linalg.svd(scaled, compute_uv=False))
     c, a = len(robot.controlled), len(moving)
     if not freedoms <= c <= a:

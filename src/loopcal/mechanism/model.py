@@ -381,9 +381,12 @@ class Mechanism(DrawnResult):
         return np.where(turns, self.size, 1.0)
 
     @cached_property
-    def reading_units(self) -> FloatArray:
-        """Lengths (a,) [m] that a unit of each reading counts for, an angle at the size."""
-        turns = [actuator.dimension is Dimension.ANGLE for actuator in self.actuators]
+    def drive_units(self) -> FloatArray:
+        """Lengths (a,) [m] that a unit of what each drive moves counts for, an angle at the size: of
+        its joint, or of its sum, which is a length where a joint slides.
+        """
+        turning = self.assembly.turning_drives
+        turns = [turning.issuperset(actuator.driven_joints) for actuator in self.actuators]
         return np.where(turns, self.size, 1.0)
 
     @cached_property

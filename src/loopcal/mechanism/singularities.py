@@ -34,7 +34,12 @@ from loopcal.mechanism.platform_coordinates import compare_coordinates, read_coo
 from loopcal.mechanism.sensitivity import differentiate_pose
 from loopcal.mechanism.solutions import Solution, forward, inverse, make_solution
 from loopcal.mechanism.states import join_states
-from loopcal.mechanism.transmission import find_fixed_rows, invert_weights, select_weights
+from loopcal.mechanism.transmission import (
+    differentiate_by_readings,
+    find_fixed_rows,
+    invert_weights,
+    select_weights,
+)
 from loopcal.mechanism.workspace import sample_workspace
 from loopcal.numerics.statistics import compute_median
 from loopcal.results.result import Result
@@ -274,7 +279,7 @@ def _scale_closure(robot: Mechanism, state: State) -> tuple[FloatArray, FloatArr
     if robot.has_sums:
         A, Q = _sum_rows(robot, state, A, Q)
     A = A / robot.twist_scale[list(program.freedoms)]
-    Q = Q / robot.reading_units[: Q.shape[2]]
+    Q = Q / robot.drive_units[: Q.shape[2]]
     good = np.asarray(np.isfinite(A).all(axis=(1, 2)) & np.isfinite(Q).all(axis=(1, 2)))
     return np.where(good[:, None, None], A, 0.0), np.where(good[:, None, None], Q, 0.0), good
 
@@ -327,7 +332,10 @@ def _compute_chain_margins(
     T, names = state.T[0], robot.controlled
     _, columns = compare_coordinates(T, read_coordinates(T, names), names, robot.size)
     moving = find_carrying_actuators(robot)
-    slope = np.matmul(columns, D[..., moving]) / robot.reading_units[moving]
+    tau = robot.slots(values)[1]
+    turned = np.abs(differentiate_by_readings(q, tau, robot.slots.constants)[0]).sum(axis=1)
+    units = robot.drive_units * np.where(turned, turned, 1.0)  # of a reading
+    slope = np.matmul(columns, D[..., moving]) / units[:, None, moving]
     good = np.isfinite(slope).all(axis=(1, 2))
     _, r, W = np.linalg.svd(np.where(good[:, None, None], slope, 0.0))
     drive_margin = np.where(good, r[:, -1], np.nan)

@@ -1,0 +1,141 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Machines that outsiders described from the documentation, against equations written here."""
+
+from pathlib import Path
+
+import numpy as np
+from numpy.testing import assert_allclose
+
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.singularities import analyze_singularity
+from loopcal.mechanism.solutions import forward, inverse, jacobian
+from loopcal.mechanism.workspace import sample_workspace
+
+ATOL = 1e-9  # [m, rad]: Newton stops below 1e-13 of the size; the rest is the condition
+POSES = 100
+
+# Peaucellier 1864: the platform is a point, and the three cranks turn.
+PEAUCELLIER = """
+format: 1
+family: limbs
+name: peaucellier
+units: {length: mm, angle: deg}
+freedoms: [x, y]
+controlled: [y]
+drives:
+  crank: {reads: angle, stroke: [-60, 60], unknown: [offset], angle: {sd: 0.1}}
+bodies: [{name: upper}, {name: lower}, {name: arm}]
+limbs:
+  - {name: a, to: upper, ending: rigid, chain: [{joint: R, name: pin, start: 25}]}
+  - {name: b, to: lower, ending: rigid, chain: [{joint: R, name: pin, start: -25}]}
+  - {name: c, to: arm, ending: rigid, chain: [{joint: R, name: pin, at: [80, 0, 0],
+     actuated: crank}]}
+  - {name: ac, on: upper, to: arm, tip: [250, 0, 0], attach: [80, 0, 0], ending: distance,
+     length: 120}
+  - {name: bc, on: lower, to: arm, tip: [250, 0, 0], attach: [80, 0, 0], ending: distance,
+     length: 120}
+  - {name: ap, on: upper, tip: [250, 0, 0], ending: distance, length: 120}
+  - {name: bp, on: lower, tip: [250, 0, 0], ending: distance, length: 120}
+home: {x: 300}
+workspace: {y: [-100, 100]}
+"""
+
+# A level-luffing crane: the hook does not turn, boom and jib do. The winch pays out the rope from
+# the mast to the jib's head and on to the hook.
+CRANE = """
+format: 1
+family: stages
+name: crane
+units: {length: m, angle: deg}
+controlled: [x, y, z]
+stages:
+  - name: slew
+    joint: {kind: R, stroke: [-180, 180], start: 20, errors: [offset]}
+  - name: luff
+    family: limbs
+    freedoms: [x, z]
+    controlled: [x, z]
+    home: {x: 22, z: 10.3}
+    bodies: [{name: boom}, {name: jib}]
+    drives:
+      rod: {reads: length, sum: {rod: 1}, stroke: [4, 12]}
+      winch: {reads: angle, radius: 0.4, sum: {stay: 1, rope: 1}, stroke: [0, 30000]}
+    limbs:
+      - {name: pivot, to: boom, ending: rigid, chain: [{joint: R, name: pin, at: [2, 0, 8],
+         axis: y, start: -60}]}
+      - {name: apex, on: boom, to: jib, ending: rigid, chain: [{joint: R, name: pin, at: [20, 0,
+         0], axis: y, start: 60}]}
+      - {name: tie, tip: [-1, 0, 14], to: jib, attach: [-5, 0, 1], ending: distance, length: 14.7}
+      - {name: rod, tip: [-1, 0, 10], to: boom, attach: [8, 0, 1], ending: distance, actuated: rod}
+      - {name: stay, tip: [-1.2, 0, 14.5], to: jib, attach: [-4.8, 0, 1.5], ending: distance,
+         actuated: stay}
+      - name: hook
+        on: jib
+        ending: rigid
+        chain:
+          - {joint: R, name: sheave, at: [10, 0, 0], axis: y}
+          - {joint: P, name: rope, axis: -z, actuated: rope, start: 15}
+workspace: {x: [12, 24], y: [-12, 12], z: [2, 12]}
+"""
+
+
+def load(text: str, folder: Path) -> Mechanism:
+    file = folder / "machine.yaml"
+    file.write_text(text)
+    return load_robot(file)
+
+
+def test_cranks_of_a_point_turn_and_draw_a_straight_line(tmp_path: Path) -> None:
+    robot = load(PEAUCELLIER, tmp_path)
+    q = np.linspace(-1.0, 1.0, POSES)[:, None]
+    joint = 0.08 * np.stack([1 + np.cos(q[:, 0]), np.sin(q[:, 0])], axis=1)
+    square = np.sum(joint**2, axis=1, keepdims=True)
+    point = joint * (0.25**2 - 0.12**2) / square  # the inverse of a circle through the center
+    solution = forward(robot, q)
+    assert_allclose(solution.T[:, :2, 3], point, rtol=0, atol=ATOL)
+    assert_allclose(point[:, 0], (0.25**2 - 0.12**2) / 0.16, rtol=0, atol=1e-15)
+    assert_allclose(inverse(robot, point[:, 1:]).q, q, rtol=0, atol=ATOL)
+    speed = 0.5 * point[0, 0] / np.cos(q[:, 0] / 2) ** 2  # y = x tan(q / 2)
+    assert_allclose(jacobian(robot, q).readings[:, 4, 0], speed, rtol=0, atol=ATOL)
+
+
+def test_hook_of_a_crane_hangs_where_boom_jib_and_rope_put_it(tmp_path: Path) -> None:
+    robot = load(CRANE, tmp_path)
+    q = sample_workspace(robot, POSES, 3).solution.q
+    solution = forward(robot, q)
+    hook = solution.T[:, :3, 3]
+    assert_allclose(hook[:, 1], hook[:, 0] * np.tan(q[:, 0]), rtol=0, atol=1e-8)  # [m], at 24 m
+    angles = solution.passive[:, [solution.passive_names.index(n) for n in PINS]]
+    boom, jib = angles[:, 0], angles.sum(axis=1)
+
+    def turn(a: np.ndarray, x: float, z: float) -> np.ndarray:
+        return np.stack([x * np.cos(a) + z * np.sin(a), z * np.cos(a) - x * np.sin(a)], axis=1)
+
+    def measure(points: np.ndarray, x: float, z: float) -> np.ndarray:
+        return np.linalg.norm(points - [x, z], axis=1)
+
+    pivot = np.array([2.0, 8.0])
+    apex = pivot + turn(boom, 20.0, 0.0)
+    head = apex + turn(jib, 10.0, 0.0)
+    tie, stay = apex + turn(jib, -5.0, 1.0), apex + turn(jib, -4.8, 1.5)
+    assert_allclose(measure(tie, -1.0, 14.0), 14.7, rtol=0, atol=1e-8)
+    assert_allclose(measure(pivot + turn(boom, 8.0, 1.0), -1.0, 10.0), q[:, 1], rtol=0, atol=1e-8)
+    radius = np.hypot(hook[:, 0], hook[:, 1])
+    assert_allclose(head[:, 0], radius, rtol=0, atol=1e-8)
+    rope = head[:, 1] - hook[:, 2] + measure(stay, -1.2, 14.5)
+    assert_allclose(rope, 0.4 * q[:, 2], rtol=0, atol=1e-8)
+
+
+PINS = ("luff.pivot.pin", "luff.apex.pin")
+
+
+def test_a_spool_moves_its_cable_as_much_as_a_drive_that_reads_the_length(tmp_path: Path) -> None:
+    spool = load(CRANE, tmp_path)
+    length = load(CRANE.replace("reads: angle, radius: 0.4", "reads: length"), tmp_path)
+    margins = [
+        analyze_singularity(robot, inverse(robot, robot.home[None])).drive_margin
+        for robot in (spool, length)
+    ]
+    assert_allclose(margins[0], margins[1], rtol=1e-9)
+    assert margins[0][0] > 0.1  # [m/m] of the winch alone: 1
