@@ -382,8 +382,8 @@ class Mechanism(DrawnResult):
 
     @cached_property
     def drive_units(self) -> FloatArray:
-        """Lengths (a,) [m] that a unit of what each drive moves counts for, an angle at the size: of
-        its joint, or of its sum, which is a length where a joint slides.
+        """Lengths (a,) [m] that a unit of what each drive moves counts for, an angle at the size.
+        It moves a joint, or a sum, which is a length where a joint slides.
         """
         turning = self.assembly.turning_drives
         turns = [turning.issuperset(actuator.driven_joints) for actuator in self.actuators]
