@@ -23,7 +23,7 @@ from loopcal.mechanism.limb_rows import (
     stack_displacement_columns,
     stack_driven_columns,
 )
-from loopcal.mechanism.model import Mechanism, ParameterUnits
+from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.states import driven_values
 from loopcal.mechanism.transmission import (
     apply_weights,
@@ -228,7 +228,7 @@ def _invert_rows(rows: FloatArray) -> FloatArray:
     return np.where(is_finite, product, np.nan)
 
 
-def _differentiate_open(
+def differentiate_open_sums(
     robot: Mechanism, values: FloatArray, q: FloatArray, state: State
 ) -> FloatArray:
     """Return the derivatives (t, n, M + J, p + a) of all nodes' freedoms and of driven joints by
@@ -251,27 +251,6 @@ def _differentiate_open(
     return out
 
 
-def differentiate_open_sums(
-    robot: Mechanism,
-    values: FloatArray,
-    q: FloatArray,
-    state: State,
-    columns: ParameterUnits | None = None,
-    nodes: int = 1,
-) -> Derivatives:
-    """Return the derivatives of the twists of the first nodes, (t, n, 6 nodes, p) and (t, n, 6
-    nodes, a), by `columns`, all parameters in SI without it.
-    """
-    chosen = robot.all_parameters if columns is None else columns
-    own = [(i, 6 * k + f) for i, (k, f) in enumerate(robot.program.unknown_twists) if k < nodes]
-    sources, targets = map(list, zip(*own, strict=True))
-    moved = _differentiate_open(robot, values, q, state)[:, :, sources]
-    twist = np.zeros((*moved.shape[:2], 6 * nodes, moved.shape[3]))
-    twist[:, :, targets] = moved
-    by_parameters, by_readings = np.split(twist, [len(robot.parameters)], axis=3)
-    return Derivatives(by_parameters[..., chosen.places] * chosen.units, by_readings)
-
-
 def differentiate_driven_joints(
     robot: Mechanism, values: FloatArray, q: FloatArray, state: State
 ) -> FloatArray:
@@ -280,7 +259,7 @@ def differentiate_driven_joints(
     """
     if robot.has_open_sums:
         M = len(robot.program.unknown_twists)
-        return _differentiate_open(robot, values, q, state)[:, :, M:]
+        return differentiate_open_sums(robot, values, q, state)[:, :, M:]
     inputs = robot.all_parameters.linearize(values, robot.slots(values)[1], q)
     joints = expand_map(robot.program, inputs)[1]
     if robot.has_sums:  # of which the map knows no reading

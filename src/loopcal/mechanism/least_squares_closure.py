@@ -101,22 +101,6 @@ class _Rows(NamedTuple):
         return self._replace(nodes=tuple(nodes))
 
 
-def differentiate_open(
-    program: Program,
-    e: FloatArray,
-    q: FloatArray,
-    state: State,
-    inputs: ParameterMap,
-    nodes: int = 1,
-) -> tuple[FloatArray, FloatArray]:
-    """Differentiate the nodes of a least-squares closure; see `loopcal.engine.differentiate`."""
-    by_input, p = differentiate_unknowns(program, e, q, state, inputs), inputs.pattern.parameters
-    freedoms = [6 * node + f for node, f in program.unknown_twists if node < nodes]
-    out = np.zeros((*state.T.shape[:2], 6 * nodes, by_input.shape[-1]))
-    out[:, :, freedoms] = by_input[:, :, : len(freedoms)]
-    return out[..., :p], out[..., p:]
-
-
 def differentiate_unknowns(
     program: Program, e: FloatArray, q: FloatArray, state: State, inputs: ParameterMap
 ) -> FloatArray:

@@ -34,15 +34,11 @@ from loopcal.mechanism.chains import (
     name_platform_entries,
     transport_to_end,
 )
-from loopcal.mechanism.least_squares_closure import (
-    differentiate_open,
-    differentiate_unknowns,
-    list_unknown_joints,
-)
+from loopcal.mechanism.least_squares_closure import differentiate_unknowns, list_unknown_joints
 from loopcal.mechanism.limb_rows import move_passive_joints, name_passive_joints
 from loopcal.mechanism.model import Mechanism, ParameterUnits
 from loopcal.mechanism.states import is_closed
-from loopcal.mechanism.transmission import apply_weights, invert_weights, joints_from_readings
+from loopcal.mechanism.transmission import apply_weights, invert_weights
 from loopcal.typing import BoolArray, FloatArray
 
 
@@ -63,25 +59,54 @@ def differentiate_pose(
     """
     if robot.stages:
         return differentiate_platform(robot, values, q, state, columns)
-    if robot.has_open_sums:
-        derivatives = differentiate_open_sums(robot, values, q, state, columns, nodes)
+    chosen = columns or robot.all_parameters
+    if robot.has_open_sums or robot.program.may_stay_open:
+        moved = _differentiate_unknowns(robot, values, q, state, chosen)
+        twists = spread_twists(robot.program, moved, nodes)
+        derivatives = np.split(twists, [len(chosen.places)], axis=3)
     else:
-        e, tau = robot.slots(values)
-        joints = joints_from_readings(q, tau, robot.slots.constants)
-        chosen = robot.all_parameters if columns is None else columns
+        e, tau, joints = drive_joints(robot, values, q)
         inputs = chosen.linearize(values, tau, q)
-        is_open = robot.program.may_stay_open
-        differentiate = differentiate_open if is_open else engine.differentiate
-        derivatives = differentiate(robot.program, e, joints, state, inputs, nodes)
+        by_parameters, turned = engine.differentiate(robot.program, e, joints, state, inputs, nodes)
         if robot.has_sums:
-            by_parameters, by_joints = derivatives
-            turns = differentiate_joints_by_readings(robot, values, q)
-            derivatives = by_parameters, np.matmul(by_joints, turns)
+            turned = np.matmul(turned, differentiate_joints_by_readings(robot, values, q))
+        derivatives = by_parameters, turned
     lost = ~is_closed(state.status)
     if lost.any():
         for derivative in derivatives:
             derivative[lost] = np.nan
     return Derivatives(*derivatives)
+
+
+def spread_twists(program: engine.Program, moved: FloatArray, nodes: int = 1) -> FloatArray:
+    """Return the twists (t, n, 6 nodes, w) of the first nodes, of the freedoms of all nodes first
+    among unknowns (t, n, u, w).
+    """
+    freedoms = [6 * node + f for node, f in program.unknown_twists if node < nodes]
+    out = np.zeros((*moved.shape[:2], 6 * nodes, moved.shape[3]))
+    out[:, :, freedoms] = moved[:, :, : len(freedoms)]
+    return out
+
+
+def _differentiate_unknowns(
+    robot: Mechanism, values: FloatArray, q: FloatArray, state: State, columns: ParameterUnits
+) -> FloatArray:
+    """Return derivatives (t, n, u, p + a), by parameters and readings, of the freedoms of all
+    nodes, then of driven joints whose sums are open, or of joints of loops that may stay open.
+    """
+    p = len(robot.parameters)
+    if robot.has_open_sums:
+        moved = differentiate_open_sums(robot, values, q, state)
+        own = moved[..., columns.places] * columns.units
+        return np.concatenate([own, moved[..., p:]], axis=3)
+    e, tau, joints = drive_joints(robot, values, q)
+    inputs = columns.linearize(values, tau, q)
+    exact = differentiate_unknowns(robot.program, e, joints, state, inputs)
+    if not robot.has_sums:
+        return exact
+    own, by_joints = np.split(exact, [len(columns.places)], axis=3)
+    turns = differentiate_joints_by_readings(robot, values, q)
+    return np.concatenate([own, by_joints @ turns], axis=3)
 
 
 def differentiate_platform(
@@ -130,15 +155,14 @@ def differentiate_by_drives(
         joints = apply_weights(inverse, u)
         by_joints = differentiate_by_drives(robot, e, joints, state, None)
         return np.matmul(by_joints, inverse[:, None])
+    given = robot.program, e, u, state, robot.program.drive_map
     if weights is not None:
-        freedoms = list(robot.program.freedoms)
-        out = np.zeros((*u.shape[:2], 6, weights.shape[1]))
         moved = differentiate_unknowns_by_sums(robot, e, state, weights)
-        out[:, :, freedoms] = moved[:, :, : len(freedoms)]
-        return out
-    is_open = robot.program.may_stay_open
-    differentiate = differentiate_open if is_open else engine.differentiate
-    return differentiate(robot.program, e, u, state, robot.program.drive_map)[1]
+    elif robot.program.may_stay_open:
+        moved = differentiate_unknowns(*given)
+    else:
+        return engine.differentiate(*given)[1]
+    return spread_twists(robot.program, moved)
 
 
 def fold_pose_rows(
@@ -186,7 +210,7 @@ def differentiate_passive_joints(
     program, p = robot.program, len(robot.parameters)
     exact = None
     if program.may_stay_open and not robot.has_open_sums:
-        unknowns = _differentiate_open_unknowns(robot, values, q, state)
+        unknowns = _differentiate_unknowns(robot, values, q, state, robot.all_parameters)
         twists, exact = np.split(unknowns, [len(program.unknown_twists)], axis=2)
     else:
         nodes = differentiate_pose(robot, values, q, state, nodes=len(program.nodes))
@@ -201,21 +225,6 @@ def differentiate_passive_joints(
         by_inputs[:, :, places] = exact
     by_inputs[~is_closed(state.status)] = np.nan
     return PassiveSensitivity(names, by_inputs[..., :p], by_inputs[..., p:])
-
-
-def _differentiate_open_unknowns(
-    robot: Mechanism, values: FloatArray, q: FloatArray, state: State
-) -> FloatArray:
-    """Return what `differentiate_unknowns` returns, by parameters and readings (t, n, u, p + a)."""
-    e, tau = robot.slots(values)
-    joints = joints_from_readings(q, tau, robot.slots.constants)
-    inputs = robot.all_parameters.linearize(values, tau, q)
-    exact = differentiate_unknowns(robot.program, e, joints, state, inputs)
-    if robot.has_sums:
-        own, by_joints = np.split(exact, [len(robot.parameters)], axis=-1)
-        turns = differentiate_joints_by_readings(robot, values, q)
-        exact = np.concatenate([own, by_joints @ turns], axis=-1)
-    return exact
 
 
 def differentiate_sensed_values(
