@@ -140,7 +140,7 @@ def differentiate_at_pose(
                 joints[rows][:, :, limb.drives] = -(both / limb.Q)
     twists = np.broadcast_to(np.eye(m, p + m, p), (*joints.shape[:2], m, p + m))
     passive = move_passive_joints(robot, values, state, twists, joints)
-    by_inputs = differentiate_driven_joints(robot, values, q, state)
+    by_inputs = differentiate_driven_joints(robot, values, q)
     joints[..., :p] -= by_inputs[..., :p]
     with np.errstate(all="ignore"):
         readings = joints / np.einsum("...jj->...j", by_inputs[..., p:])[..., None]
@@ -251,15 +251,10 @@ def differentiate_open_sums(
     return out
 
 
-def differentiate_driven_joints(
-    robot: Mechanism, values: FloatArray, q: FloatArray, state: State
-) -> FloatArray:
-    """Return derivatives (t | 1, n | 1, J, p + a) of driven joints by parameters in SI and by
-    readings.
+def differentiate_driven_joints(robot: Mechanism, values: FloatArray, q: FloatArray) -> FloatArray:
+    """Return derivatives (t | 1, n | 1, J, p + a) of driven joints, without open sums, by
+    parameters in SI and by readings.
     """
-    if robot.has_open_sums:
-        M = len(robot.program.unknown_twists)
-        return differentiate_open_sums(robot, values, q, state)[:, :, M:]
     inputs = robot.all_parameters.linearize(values, robot.slots(values)[1], q)
     joints = expand_map(robot.program, inputs)[1]
     if robot.has_sums:  # of which the map knows no reading

@@ -105,24 +105,22 @@ POINT = 1e-9  # ratio of size and longest link below which all limbs begin and e
 
 
 def build(
-    assembly: Assembly, units: Mapping[Dimension, str] | None = None, record: Any = None
+    assembly: Assembly,
+    units: Mapping[Dimension, str] | None = None,
+    record: Any = None,
+    *,
+    is_stage: bool = False,
 ) -> Mechanism:
     """Compile the assembly of a family for the engine and find its home position.
 
     units : display units of the file. record : the family record, kept for writing the file.
+    is_stage : whether other stages carry it or are on it.
     Raises MechanismError: duplicate or unknown names, loops that cannot be closed at home, wrong
         mobility, coordinates that cannot be controlled.
     """
-    check_assembly(assembly)
+    check_assembly(assembly, is_stage=is_stage)
     if assembly.stages:
         return _build_chain(assembly, units or {}, record)
-    return _compile(assembly, units, record)
-
-
-def _compile(
-    assembly: Assembly, units: Mapping[Dimension, str] | None = None, record: Any = None
-) -> Mechanism:
-    """Compile a checked mechanism of one stage; see `build`."""
     robot = _close_at_home(assembly, units, record)
     is_placed = robot.is_serial and not robot.controlled
     return robot if is_placed else report_over_constraint(robot, _close_at_home)
@@ -492,8 +490,7 @@ def _build_stages(attached: Sequence[AttachedStage]) -> tuple[Stage, ...]:
     p = a = g = 0
     for stage in attached:
         try:
-            check_assembly(stage.assembly, is_stage=True)
-            robot = _compile(stage.assembly)
+            robot = build(stage.assembly, is_stage=True)
         except MechanismError as error:
             raise MechanismError(f"stage {stage.name!r}: {error}") from None
         if robot.program.sigma is not None or robot.has_redundant_sums:

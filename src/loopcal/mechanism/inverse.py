@@ -425,7 +425,10 @@ def _solve_by_drives(
     first = begin.select((t, n), *np.divmod(np.arange(t * n), n))
     start = _begin(rows, first)
     rows = replace(rows, sign=start.sign)
-    last = _solve_rows(rows, start, first, follow)
+    last = rows.iterate(start if robot.stages else _begin_near_targets(rows, start, first))
+    wrong = np.flatnonzero(last.status != CONVERGED)
+    if follow and len(wrong):
+        last = last.put(wrong, _follow_path(rows.select(wrong), start.take(wrong)))
     status = np.where(np.isfinite(wanted).all(axis=1), last.status, np.int8(NOT_FINITE))
     state = rows.join_states(last)
     left = np.linalg.norm(
@@ -506,16 +509,6 @@ def _begin(rows: _Rows, first: State) -> _Iterate:
         if not stage.robot.is_serial:
             loops.append(own)
     return rows.evaluate(u, tuple(loops))
-
-
-def _solve_rows(rows: _Rows, start: _Iterate, first: State, follow: bool) -> _Iterate:
-    """Return the last iterates of rows from their start, the state `first`."""
-    begin = start if rows.robot.stages else _begin_near_targets(rows, start, first)
-    solved = rows.iterate(begin)
-    wrong = np.flatnonzero(solved.status != CONVERGED)
-    if not (follow and len(wrong)):
-        return solved
-    return solved.put(wrong, _follow_path(rows.select(wrong), start.take(wrong)))
 
 
 def _begin_near_targets(rows: _Rows, start: _Iterate, first: State) -> _Iterate:

@@ -209,14 +209,17 @@ def differentiate_passive_joints(
         return PassiveSensitivity(names, *whole)
     program, p = robot.program, len(robot.parameters)
     exact = None
-    if program.may_stay_open and not robot.has_open_sums:
+    if program.may_stay_open or robot.has_open_sums:
         unknowns = _differentiate_unknowns(robot, values, q, state, robot.all_parameters)
         twists, exact = np.split(unknowns, [len(program.unknown_twists)], axis=2)
     else:
         nodes = differentiate_pose(robot, values, q, state, nodes=len(program.nodes))
         freedoms = [6 * node + f for node, f in program.unknown_twists]
         twists = np.concatenate(nodes, axis=3)[:, :, freedoms]
-    driven = differentiate_driven_joints(robot, values, q, state)
+    if robot.has_open_sums:
+        driven, exact = exact, None
+    else:
+        driven = differentiate_driven_joints(robot, values, q)
     by_inputs = move_passive_joints(robot, values, state, twists, driven)
     if exact is not None:
         limbs = robot.assembly.limbs

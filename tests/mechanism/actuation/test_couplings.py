@@ -258,7 +258,7 @@ def test_two_fingers_on_one_motor_agree_with_their_drawing(tmp_path: Path) -> No
             RACK,
             "of: length, sum: {slide: 1}, radius: {arm.pinion: -12}",
             "of: length, sum: {arm.pinion: 1}",
-            "List it under `radius:`",
+            "or under `radius:`",
         ),
     ],
 )

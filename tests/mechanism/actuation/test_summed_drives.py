@@ -526,7 +526,7 @@ SECOND, THIRD = "q2: {reads: length, sum: {m: 1, k: 2}}", "q3: {reads: length, s
         (f"  {THIRD}\n", "", "'h' of limb 'H' is in no sum", 8),
         (f"  {SECOND}\n  {THIRD}\n", "  q2: {reads: length, sum: {k: 1, h: 2}}\n",
          "it can move while all sums are constant", None),
-        (THIRD, "q3: {reads: angle, sum: {n: 1, h: 2}}", "adds angles, but 'n' slides", None),
+        (THIRD, "q3: {reads: angle, sum: {n: 1, h: 2}}", "adds angles and 'n', which slides", None),
         (THIRD, "q3: {triangle: {foot: [1, 0, 0], head: [0, 1, 0]}}", "drives no joint", 10),
     ],
 )  # fmt: skip
@@ -545,7 +545,7 @@ def test_a_sum_of_an_angle_and_a_length_is_refused(tmp_path: Path) -> None:
     text = WRIST.replace("{joint: R, name: b", "{joint: P, name: b").replace(
         "start: 60", "start: 6"
     )
-    with pytest.raises(FileError, match="adds angles, but 'j2' slides"):
+    with pytest.raises(FileError, match="adds angles and 'j2', which slides"):
         load_text(tmp_path, text)
 
 

@@ -720,18 +720,12 @@ def _name_joints(
                     f"{suggest_names(alias, list(known))}. Write limb.joint or the name of a drive"
                 )
             if joints[known[alias][0]].turns != part.turns:
-                what, remedy = f"adds lengths, but {alias!r} turns", "Sum joints of one kind"
-                if part.word == "radius":
-                    what, remedy = (
-                        f"has a radius of {alias!r}, which slides",
-                        "List it under `sum:`",
-                    )
-                elif part.turns:
-                    what = f"adds angles, but {alias!r} slides"
-                    remedy = "Give `of: length` or `reads: length`"
-                elif isinstance(stated, Radii):
-                    remedy = "List it under `radius:`"
-                raise refuse(f"{what}. {remedy}")
+                what = f"adds lengths, but {alias!r} turns"
+                if part.turns:
+                    kind = "adds angles and" if part.word == "weight" else "has a radius of"
+                    what = f"{kind} {alias!r}, which slides"
+                remedy = "joints that turn in one of angles, or under `radius:`"
+                raise refuse(f"{what}. List slides in a sum of lengths, {remedy}")
             if not np.isfinite(weight):
                 raise stated.refuse(
                     key, f"gives {alias!r} the weight {weight:g}. Give a finite number"
