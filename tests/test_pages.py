@@ -21,6 +21,7 @@ from tests.cli.test_executed_pages import PAGES as EXECUTED_PAGES
 
 OWN_TESTS = {
     "README.md": "tests/test_readme.py",
+    "docs/app.md": "tests/app/test_page.py",
     "docs/extending.md": "tests/test_extending.py",
     "docs/hexapod-with-tracker.md": "tests/cli/test_hexapod_page.py",
     "docs/python.md": "tests/report/test_python_page.py",

@@ -7,7 +7,7 @@ Given rows and words change the state and the files of the session; what they me
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -52,7 +52,6 @@ from loopcal.planning.companion import (
 )
 from loopcal.planning.constraints import restore_options
 from loopcal.results.tables import (
-    Block,
     Column,
     Table,
     format_uncertainty,
@@ -102,10 +101,13 @@ def prepare_session(
 
 @dataclass
 class MeasuringSession:
-    """The state of one session: rows, skipped poses, and the pose to measure next."""
+    """The state of one session: rows, skipped poses, and the pose to measure next; `say` shows
+    paragraphs, tables and findings.
+    """
 
     task: CompanionTask
     journal: Journal
+    say: Callable[..., None]
     export: GrowingExport | None = None
     gcode: bool = False
     state: Companion = field(init=False)
@@ -113,10 +115,6 @@ class MeasuringSession:
     chosen: int | None = None
     pose: int | None = None
     progress: tuple[Finding, ...] = ()
-
-    def say(self, *lines: Block | Finding) -> None:
-        """Show lines or findings."""
-        raise NotImplementedError
 
     def resume(self) -> None:
         """Take the rows that are on the disk."""

@@ -121,7 +121,7 @@ def test_no_message_of_the_library_names_a_command_line_option():
     named = {
         name
         for name, tree in parse_modules().items()
-        if not name.startswith("cli/")
+        if not name.startswith(("cli/", "app/"))  # app writes the words of commands
         for node in ast.walk(tree)
         if isinstance(node, ast.Constant)
         and isinstance(node.value, str)

@@ -263,7 +263,7 @@ def test_every_option_that_takes_a_count_has_a_limit() -> None:
                 used.add(option.type.limit)
             elif isinstance(option.type, click.types.IntParamType):
                 unlimited.add(option.name)
-    assert unlimited == {"seed", "keep", "a_year"}
+    assert unlimited == {"seed", "keep", "a_year", "port"}
     assert used == set(COUNTED)
     assert [getattr(limits, name) for name in COUNTED] == list(limits.COUNT_LIMITS)
 

@@ -50,14 +50,16 @@ PATHS = (
 
 
 def list_commands() -> dict[str, click.Command]:
-    """Return every command by name, but for those of groups, which have a corpus of their own."""
+    """Return every command by name, but for those of groups, which have a corpus of their own, and
+    for `app`, which serves until it is stopped.
+    """
     names = [name for members in entry_point.SECTIONS.values() for name in members]
     group, context = entry_point.command_line, click.Context(entry_point.command_line)
     commands = {name: group.get_command(context, name) for name in names}
     return {
         name: command
         for name, command in commands.items()
-        if command is not None and not isinstance(command, click.Group)
+        if name != "app" and command is not None and not isinstance(command, click.Group)
     }
 
 

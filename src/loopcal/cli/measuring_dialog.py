@@ -11,7 +11,6 @@ import queue
 import sys
 import threading
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 from loopcal.cli.hints import with_hint
 from loopcal.cli.terminal import print_text, width
@@ -24,11 +23,15 @@ from loopcal.results.tables import Block, render_text
 POLL = 0.5  # seconds between two looks at a followed export
 
 
-@dataclass
+def print_lines(*lines: Block | Finding) -> None:
+    """Print lines or findings, wrapped."""
+    if lines:
+        words = [with_hint(line) if isinstance(line, Finding) else line for line in lines]
+        print_text(render_text(words, width()) + "\n")
+
+
 class Dialog(MeasuringSession):
     """The dialog of one session on a terminal."""
-
-    is_silent: bool = False
 
     def run(self) -> None:
         """Ask for rows until the work is done, or the input ends."""
@@ -55,14 +58,6 @@ class Dialog(MeasuringSession):
             elif self.take(given):
                 return True
         return False
-
-    def say(self, *lines: Block | Finding) -> None:
-        """Print lines or findings, wrapped; nothing with --json."""
-        if lines and not self.is_silent:
-            words = [with_hint(line) if isinstance(line, Finding) else line for line in lines]
-            print_text(render_text(words, width()) + "\n")
-
-    # What comes in.
 
     def _list_inputs(self) -> Iterator[str | Row]:
         """Give typed lines and rows of the export as they come; without an export until the input

@@ -10,6 +10,7 @@ import shutil
 import sys
 import textwrap
 import threading
+import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -31,6 +32,11 @@ FORMAT = 1  # of the documents that --json prints and no file holds: output.sche
 WIDEST = 120  # characters of the longest line of prose, on wide terminals
 LONGEST_MESSAGE = 4000  # characters of a message; a longer one lists more than anybody reads
 DELAY = 2.0  # seconds of work before progress is shown
+PAGE = "LOOPCAL_PAGE"
+"""Variable with which `loopcal app` runs commands: their pages are HTML, and they write progress on
+standard error as lines that begin with `MARK`.
+"""
+MARK, INTERVAL = "\x1e", 0.1  # seconds between two lines of progress
 
 
 def width() -> int:
@@ -66,6 +72,10 @@ def print_output(output: Output, as_json: bool) -> int:
         print_text(to_json(add_findings(number | content)))
     elif isinstance(page, str):
         print_text(page)
+    elif page and PAGE in os.environ:
+        from loopcal.results.notebook import render_html
+
+        print_text(render_html(page, style=""))
     elif page:
         from loopcal.results.tables import render_text
 
@@ -205,9 +215,12 @@ class TerminalProgress:
         self._task: Any = None
         self._state: tuple[int, int, str] | None = (0, 1, step) if step else None
         self._total: int | None = None
+        self._written = -INTERVAL
 
     def __enter__(self) -> Self:
-        if sys.stderr.isatty():
+        if PAGE in os.environ and self._state is not None:
+            self._write(*self._state)
+        elif sys.stderr.isatty():
             self._timer.start()
         return self
 
@@ -230,6 +243,13 @@ class TerminalProgress:
             self._state = (done, total, what)
             if self._bar is not None:
                 self._draw(*self._state)
+        if PAGE in os.environ and time.monotonic() > self._written + INTERVAL:
+            self._write(done, total, what)
+
+    def _write(self, done: int, total: int, what: str) -> None:
+        """Write progress as a line."""
+        self._written = time.monotonic()
+        click.echo(f"{MARK}{done}\t{total}\t{escape(what)}", err=True)
 
     def _start(self) -> None:
         """Begin to draw, after the delay."""

@@ -27,8 +27,8 @@ STYLE = (
 )
 
 
-def render_html(blocks: Iterable[Block]) -> str:
-    """Return a page as one `<div>`; of tables the first `MOST_ROWS` rows.
+def render_html(blocks: Iterable[Block], style: str = STYLE) -> str:
+    """Return a page as one `<div>` with a style; of tables the first `MOST_ROWS` rows.
 
     Names are shown as they are written: markup and control characters have no effect.
     """
@@ -41,7 +41,7 @@ def render_html(blocks: Iterable[Block]) -> str:
                     sections.append(f"<pre>and {more} more {'row' if more == 1 else 'rows'}</pre>")
         elif text := "\n".join(str(block) for block in group).strip("\n"):
             sections.append(f"<pre>{html.escape(text)}</pre>")
-    return escape(f'<div class="loopcal">{STYLE}{"".join(sections)}</div>', "\n")
+    return escape(f'<div class="loopcal">{style}{"".join(sections)}</div>', "\n")
 
 
 def build_main_table(records: Records, caption: str = "") -> Table:

@@ -69,7 +69,7 @@ def measure(
       loopcal measure plan -o session --minutes 2 --gcode
       loopcal measure plan -o session --follow points.txt --profile leica
     """
-    from loopcal.cli.measuring_dialog import Dialog
+    from loopcal.cli.measuring_dialog import Dialog, print_lines
     from loopcal.findings.wording import name_count
     from loopcal.io.exports.growing_export import GrowingExport
     from loopcal.io.exports.profile import find_profile_file, read_profile, with_local_settings
@@ -97,9 +97,10 @@ def measure(
         read = read_profile(find_profile_file(profile))
         read = with_local_settings(read, unit, decimal == "comma")
         export = GrowingExport(follow, read, entry, by_order)
-    is_silent = bool(click.get_current_context().params["as_json"])
+    is_silent = click.get_current_context().params["as_json"]
+    say = (lambda *_: None) if is_silent else print_lines
     with open_session(output, table, [column.name for column in entry.kind.columns]) as journal:
-        dialog = Dialog(task, journal, export, gcode, is_silent=is_silent)
+        dialog = Dialog(task, journal, say, export, gcode)
         with suppress(KeyboardInterrupt):  # each row is on the disk
             dialog.run()
     visits = journal.visits

@@ -43,6 +43,7 @@ FILES: Mapping[str, tuple[str, ...]] = {
     "studies": ("study",),
     "plan": ("plan",),
     "companion": ("companion", "session"),
+    "app": ("app",),
     "sheets": ("sheet",),
     "pictures": ("pictures",),
     "study_folders": ("store", "workers"),

@@ -234,6 +234,20 @@ ARRAYS_SIZE = FileLimit(
 ARRAYS_COUNT = FileLimit(
     "arrays of a run folder", 1_000, "arrays", "members of `arrays.npz`", "repeat the calibration"
 )
+UPLOAD_SIZE = FileLimit(
+    "size of a file that is given to the page",
+    50,
+    "MB",
+    "files of `loopcal app`",
+    "divide it, or use the command loopcal calibrate",
+)
+UPLOADS = FileLimit(
+    "files that are given to the page",
+    50,
+    "files",
+    "files of one machine in `loopcal app`, and machines",
+    "remove one that you no longer need",
+)
 
 # All limits, in the order of docs/files.md.
 LIMITS = tuple(value for value in vars().values() if isinstance(value, FileLimit))

@@ -282,7 +282,8 @@ class DeltaFirmware:
         """The format."""
         about = f"M665 and M666 of {self.program} ({self.printed})"
         used = {"sigma_height": "", "sigma_tape": "arms", "probes": self.probes}
-        return Format(self.name, about, (self.ending,), self.read, self.write, read_options=used)
+        functions = {"read": self.read, "write": self.write, "read_options": used}
+        return Format(self.name, about, (self.ending,), **functions, mark="M66[59]")
 
     def find_foreign(self, file: GcodeFile) -> tuple[str, int] | None:
         """Return what only the other firmware writes, with its line (from 0)."""

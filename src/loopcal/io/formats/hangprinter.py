@@ -422,4 +422,5 @@ FORMAT = Format(
         "sigma_tape": "lines at the origin",
         "sigma_anchor": "",
     },
+    mark=f'"{SAMPLES}"',
 )

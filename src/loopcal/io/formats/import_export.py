@@ -9,6 +9,7 @@ interval, empty (null in JSON) where it is unknown or not finite.
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -48,6 +49,15 @@ def choose_format(path: Path, name: str | None, *, is_written: bool = False) -> 
         raise FileError(report_finding("files.report-first"), path)
     names = list_formats("write" if is_written else "read")
     raise FileError(report_finding("files.format-unknown", formats=names), path)
+
+
+def recognize_format(path: Path, text: str) -> str | None:
+    """Return the name of the format of a file by its ending and text; None without one."""
+    readable = [FORMATS[name] for name in list_formats("read")]
+    fitting = [entry for entry in readable if re.search(entry.mark or "(?!)", text)]
+    plain = [entry for entry in readable if not entry.mark]
+    of_ending = [e for e in (*fitting, *plain) if path.suffix.lower() in e.endings]
+    return next((entry.name for entry in (*of_ending, *fitting)), None)
 
 
 def build_imported_robot(path: Path, imported: Imported) -> Mechanism:

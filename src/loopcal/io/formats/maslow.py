@@ -150,4 +150,5 @@ FORMAT = Format(
     read,
     write,
     read_options={"sigma_line": "belts", "probes": "log with CLBM"},
+    mark="Maslow_tlX",
 )

@@ -167,6 +167,7 @@ class Format:
         such as which lengths are taped, for help texts.
     table : of a format of corrections what it corrects, and the most nodes that it may have, in all
         and along an axis: see `loopcal.apply.compensation.TableSize`.
+    mark : pattern of a text that files have, by which those with another ending are recognized.
     stores_fit : whether a file contains a geometry together with the measurements that its firmware
         fitted it to, so that `loopcal.diagnose` can compare the two.
     """
@@ -180,6 +181,7 @@ class Format:
     read_options: Mapping[str, str] = field(default_factory=dict)
     stores_fit: bool = False
     table: tuple[What, int, int] | None = None
+    mark: str = ""
 
 
 def get_record(

@@ -1,0 +1,396 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The files of one machine in a folder, and the commands that work on them.
+
+    NAME                files as they were given
+    result/             what the commands write; robot file and data of a controller's file, too
+    plan/, session/     a plan, and the rows that were measured of it or of a given sheet
+    choices             what was chosen; files that are given have an ending
+
+Nothing is computed here: commands run as processes of their own, which can be stopped; the
+companion is `loopcal.measuring`, as on the terminal.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import re
+import shutil
+import sys
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack, suppress
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import psutil
+
+from loopcal.errors import DataError, FileError
+from loopcal.findings import Finding, report_finding
+from loopcal.io.core.csv_table import Cells, format_header, format_row, read_template
+from loopcal.io.core.limits import UPLOAD_SIZE, UPLOADS, make_name
+from loopcal.io.core.text_file import read_json, read_text, to_json, write_text
+from loopcal.io.formats import FORMATS
+from loopcal.io.formats.import_export import recognize_format
+from loopcal.io.robot.robot_file import list_shipped_robots
+from loopcal.measuring import MeasuringSession
+from loopcal.results.notebook import render_html
+from loopcal.results.tables import Block, choose_unit, format_in
+from loopcal.units import DISPLAY_UNITS
+
+LONGEST = 80  # characters of the name of a file
+HEAD = 200_000  # characters by which a file is recognized
+STATE = "choices"
+RUN, SESSION, SHEET = "result/run", "session/measurements.csv", "plan/measurements.csv"
+KINDS = ("robot", "data", "log", "closures", "other")  # of files that are no program's
+FIT = ("hold-out", "noise", "loss")  # options of `calibrate`
+OPTIONS = {"length_unit": "unit", "home_height": "home-z"}  # of `import`, with other names
+# What an instrument measures -> options of `loopcal plan`.
+INSTRUMENTS = {
+    "position": ("--kind=position", "--frames=base"),
+    "pose": ("--kind=pose", "--frames=base"),
+    "distance": ("--kind=distance",),
+    "height": ("--measure=z",),
+}
+
+
+def clean_name(name: str) -> str:
+    """Return a name of a client as that of a file: without folders and characters with a meaning,
+    not hidden, no option, and with an ending, which folders do not have.
+    """
+    last = re.split(r"[/\\]", make_name(name[-LONGEST:]))[-1]
+    safe = re.sub(r'[<>:"|?*]', "_", last).lstrip(".- ").rstrip(". ")
+    if not safe:
+        raise DataError(report_finding("app.unnamed"))
+    return safe if Path(safe).suffix else f"{safe}.txt"
+
+
+def recognize(path: Path) -> str:
+    """Return the kind of a file: the name of a format, or one of `KINDS`."""
+    with path.open(encoding="utf-8", errors="replace") as file:
+        head, ending = file.read(HEAD), path.suffix.lower()
+    if ending in (".yaml", ".yml") and re.search(r"^family\s*:", head, re.MULTILINE):
+        return "robot"
+    if name := recognize_format(path, head):
+        return name
+    if ending == ".csv" and not head.startswith("RepRapFirmware"):
+        return "data"
+    return "other" if ending in (".yaml", ".yml", ".json") else "log"
+
+
+@dataclass
+class Choices:
+    """What people chose, and what commands said. kinds : file -> kind. settings : option -> value.
+    dropped : poses that are left out. pages, codes : command -> what it printed, as HTML, and its
+    exit code. is_measured : whether the rows of the session are the data. runs, edits : number of
+    calibrations, and of changes since the last one.
+    """
+
+    kinds: dict[str, str] = field(default_factory=dict)
+    settings: dict[str, str] = field(default_factory=dict)
+    dropped: list[str] = field(default_factory=list)
+    pages: dict[str, str] = field(default_factory=dict)
+    messages: list[str] = field(default_factory=list)
+    codes: dict[str, int] = field(default_factory=dict)
+    is_measured: bool = False
+    runs: int = 0
+    edits: int = 0
+
+
+class Project:
+    """The files of one machine; `version` grows when a page is to be drawn again."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.state, self.version = folder, folder / STATE, 0
+        stored = read_json(self.state, "project", "remove it") if self.state.exists() else {}
+        self.chosen, self.opened = Choices(**stored), ExitStack()
+        self.progress: tuple[str, int, int] | None = None
+        self.work: asyncio.Task[None] | None = None
+        self.process: asyncio.subprocess.Process | None = None
+        self.session: MeasuringSession | None = None
+        self.said: list[Block] = []
+
+    def list_files(self, kind: str) -> list[str]:
+        """Return the given files of a kind."""
+        return [name for name, of in self.chosen.kinds.items() if of == kind]
+
+    def has(self, name: str) -> bool:
+        """Return whether a file exists."""
+        return (self.folder / name).is_file()
+
+    @property
+    def program(self) -> str | None:
+        """The file of a controller or another program, if there is one."""
+        return next((name for name, kind in self.chosen.kinds.items() if kind not in KINDS), None)
+
+    @property
+    def robot(self) -> str:
+        """The robot file, given or read from the program's, or the name of a shipped robot."""
+        imported = [f"result/{Path(self.program).stem}.yaml"] if self.program else []
+        shipped = set(list_shipped_robots()) & {self.chosen.settings.get("robot")}
+        return next(iter([*self.list_files("robot"), *imported, *shipped]), "")
+
+    @property
+    def data(self) -> list[str]:
+        """The measurement files: of the session, given ones, or those in the program's file."""
+        imported = [f"result/{Path(self.program).stem}.csv"] if self.program else []
+        return [SESSION] if self.chosen.is_measured else self.list_files("data") or imported
+
+    def add(self, name: str, content: bytes) -> None:
+        """Add a file, or replace that of its name."""
+        name, kinds = clean_name(name), self.chosen.kinds
+        UPLOADS.check(len({*kinds, name}), "page", name)
+        (self.folder / name).write_bytes(content)
+        kind = recognize(self.folder / name)
+        is_first = kind in KINDS or self.program in (None, name)
+        kinds[name] = kind if is_first else "log"  # such as bed.g beside config.g
+        self.forget()
+
+    def change(
+        self, kinds: Mapping[str, str] = {}, settings: Mapping[str, str] = {}, remove: str = ""
+    ) -> None:
+        """Change kinds of files or settings, or remove a file."""
+        known = self.chosen.kinds
+        known |= {n: k for n, k in kinds.items() if n in known and k in (*KINDS, *FORMATS)}
+        self.chosen.settings |= {str(key): str(value) for key, value in settings.items()}
+        if known.pop(remove, None):
+            (self.folder / remove).unlink(missing_ok=True)
+        if not kinds and not remove and settings.keys() <= set(FIT):
+            self._edit()
+        else:
+            self.forget()
+
+    def forget(self) -> None:
+        """Remove what was made of files that have changed."""
+        shutil.rmtree(self.folder / "result", ignore_errors=True)
+        self.chosen.dropped, self.chosen.pages, self.chosen.messages = [], {}, []
+        self.store()
+
+    def _edit(self) -> None:
+        """Count a change that the result does not contain."""
+        self.chosen.edits += 1
+        self.store()
+
+    def store(self) -> None:
+        """Keep what was chosen."""
+        write_text(self.state, to_json(asdict(self.chosen)))
+        self.version += 1
+
+    # Commands: the functions return title -> words of those to run.
+
+    def calibrate(self) -> dict[str, list[str]]:
+        """Read the program's file, calibrate, write the report and the corrected file."""
+        steps, result, program = self._import(bool(self.data)), self.folder / "result", self.program
+        self.chosen.edits, self.chosen.runs = 0, self.chosen.runs + 1
+        shutil.rmtree(result / "run", ignore_errors=True)
+        shutil.rmtree(result / "files", ignore_errors=True)
+        (result / "files").mkdir(parents=True)
+        given = [(key, self.chosen.settings.get(key)) for key in FIT]
+        options = [f"--{key}={value}" for key, value in given if value]
+        options += [f"--drop={label}" for label in self.chosen.dropped]
+        steps["calibrate"] = ["calibrate", self.robot, *self.data, "-o", RUN, *options]
+        steps["report"] = ["report", RUN, "-o", "result/files/report.html"]
+        if program and (entry := FORMATS[self.chosen.kinds[program]]).write:
+            into = ["--into", program] if entry.takes_file else []
+            words = ["export", RUN, "--format", entry.name, *into]
+            steps["export"] = [*words, "-o", f"result/files/{program}"]
+        return steps
+
+    def print_report(self) -> dict[str, list[str]]:
+        """Print the report to a PDF file."""
+        report = "result/files/report.html"
+        return {"report": ["report", RUN, "-o", report, "--pdf", "--force"]}
+
+    def plan(self, instrument: str, poses: str, accuracy: str, sigma: str) -> dict[str, list[str]]:
+        """Plan which poses to measure."""
+        options = [*INSTRUMENTS[instrument], f"--sigma-position={sigma}" if sigma else ""]
+        options += [f"--accuracy={accuracy}" if accuracy else f"--poses={poses}"]
+        words = ["plan", self.robot, "-o", "plan", "--force", *filter(None, options)]
+        return {**self._import(has_data=False), "plan": words}
+
+    def _import(self, has_data: bool) -> dict[str, list[str]]:
+        """Return the command that reads the program's file, unless it was read."""
+        if not self.robot:
+            raise DataError(report_finding("app.incomplete", missing="robot"))
+        if not self.program or self.list_files("robot") or self.has(self.robot):
+            return {}
+        (self.folder / "result").mkdir(exist_ok=True)
+        words = ["import", self.program, "--format", self.chosen.kinds[self.program]]
+        words += ["-o", self.robot]
+        is_inside = has_data and not (self.chosen.is_measured or self.list_files("data"))
+        words += ["--data", self.data[0]] if is_inside else []
+        words += [f"--probes={name}" for name in self.list_files("log")]
+        words += [f"--closures={name}" for name in self.list_files("closures")]
+        settings = self.chosen.settings
+        asked = (key for key in self._list_questions() if settings.get(key))
+        words += [f"--{OPTIONS.get(key, key.replace('_', '-'))}={settings[key]}" for key in asked]
+        return {"import": words}
+
+    def _list_questions(self) -> list[str]:
+        """Return the options of reading the program's file that are no files."""
+        kind = self.chosen.kinds.get(self.program or "")
+        options = FORMATS[kind].read_options if kind else ()
+        return [key for key in options if key not in ("probes", "closures")]
+
+    async def run(self, steps: Mapping[str, Sequence[str]]) -> None:
+        """Run commands one after the other, until one refuses."""
+        pipe, chosen = asyncio.subprocess.PIPE, self.chosen
+        environment = {**os.environ, "LOOPCAL_PAGE": "html", "PYTHONIOENCODING": "utf-8"}
+        try:
+            chosen.messages = []
+            for title, words in steps.items():
+                self.progress = (title, 0, 0)
+                self.version += 1
+                command = (sys.executable, "-P", "-m", "loopcal", *words)
+                self.process = await asyncio.create_subprocess_exec(
+                    *command, cwd=self.folder, env=environment, stdout=pipe, stderr=pipe
+                )
+                assert self.process.stdout is not None
+                out = asyncio.create_task(self.process.stdout.read())
+                await self._listen(self.process.stderr)
+                chosen.pages[title], code = (await out).decode(), await self.process.wait()
+                chosen.codes[title] = code
+                if code not in (0, 2):
+                    return
+        finally:
+            self.work = self.process = self.progress = None
+            with suppress(OSError, FileError):  # the folder may be gone
+                self.store()
+
+    async def _listen(self, stream: asyncio.StreamReader | None) -> None:
+        """Take progress and messages of a command."""
+        assert stream is not None
+        async for line in stream:
+            text = line.decode().rstrip("\r\n")
+            if text.startswith("\x1e"):  # see `loopcal.cli.terminal`
+                done, total, what = text[1:].split("\t")
+                self.progress = (what, int(done), int(total))
+            elif text:
+                self.chosen.messages.append(text)
+            self.version += 1
+
+    def stop(self) -> None:
+        """End the command that runs, and what it has started."""
+        if self.work is None or self.process is None:
+            return
+        self.work.cancel()
+        with suppress(psutil.NoSuchProcess):
+            process = psutil.Process(self.process.pid)
+            for each in (*process.children(recursive=True), process):
+                each.kill()
+
+    # Rows
+
+    def list_rows(self) -> dict[str, Any]:
+        """Return the tables of the measurement files, with the largest residual of each pose."""
+        from loopcal.estimate.result import residuals_from_arrays
+        from loopcal.io.runs.run_folder import read_run_folder
+
+        found, tables, held_out = dict[str, tuple[float, str]](), [], ()
+        if self.has(f"{RUN}/result.json"):
+            result, arrays = read_run_folder(self.folder / RUN)
+            held_out = (result.get("split") or {"held_out": ()})["held_out"]
+            excluded = result.get("fit", {}).get("dropped") or ()
+            for of in residuals_from_arrays(arrays):
+                for label, raw, white in zip(of.poses, of.raw, abs(of.whitened), strict=True):
+                    i = int(white.argmax())
+                    unit = choose_unit(DISPLAY_UNITS[of.dimensions[i]], [raw[i]])
+                    text = f"{of.components[i]} {format_in(unit, raw[i], 3)} {unit.symbol}"
+                    found[label] = max(found.get(label, (0.0, "")), (float(white[i]), text))
+            found = {label: of for label, of in found.items() if label not in excluded}
+        for name in filter(self.has, self.data):
+            table = read_template(self.folder / name)
+            places = zip(table.lines, table.pose_names(), table.rows, strict=True)
+            rows = [(*place, *found.get(place[1], (None, ""))) for place in places]
+            tables.append({"file": name, "header": format_header(table.units), "rows": rows})
+        return {"tables": tables, "held_out": held_out, "dropped": self.chosen.dropped}
+
+    def correct(self, file: str, line: int, column: int, text: str) -> None:
+        """Replace a cell of a measurement file; FileError where it must be a number."""
+        if file not in self.data:
+            raise DataError(report_finding("app.gone"))
+        table, path, text = read_template(self.folder / file), self.folder / file, text.strip()
+        row, name = list(table.lines).index(line), table.names[column]
+        if table.units[name] is not None:
+            one = replace(table, columns={name: Cells([text])}, lines=[line])
+            one.scaled_numbers(name, 1.0)
+        cells = list(list(table.rows)[row])
+        cells[column] = text
+        lines = read_text(path, "measurement file").split("\n")
+        lines[line - 1] = format_row(cells) + "\r" * lines[line - 1].endswith("\r")
+        write_text(path, "\n".join(lines))
+        self._edit()
+
+    def leave_out(self, pose: str, is_out: bool) -> None:
+        """Leave a pose out of the next calibration, or use it again."""
+        others = [each for each in self.chosen.dropped if each != pose]
+        self.chosen.dropped = others + [pose] * is_out
+        self._edit()
+
+    # Measuring
+
+    def measure(self) -> None:
+        """Measure the poses of the plan or of a given sheet, or go on with it."""
+        import loopcal as lc
+        from loopcal.io.runs.session_folder import open_session
+        from loopcal.measuring import prepare_session
+        from loopcal.planning.companion import CompanionTask, Pace
+
+        sheets = [name for name in (SHEET, *self.list_files("data")) if self.has(name)]
+        if not self.robot or not sheets:
+            missing = "sheet of a plan" if self.robot else "robot"
+            raise DataError(report_finding("app.incomplete", missing=missing))
+        robot = lc.load_robot(self.folder / self.robot if self.has(self.robot) else self.robot)
+        task, table, entry = prepare_session(
+            self.folder / sheets[0], robot, None, Pace(), CompanionTask.check_every
+        )
+        columns = [column.name for column in entry.kind.columns]
+        with ExitStack() as stack:
+            journal = stack.enter_context(open_session(self.folder / "session", table, columns))
+            session = MeasuringSession(task, journal, self._say)
+            session.resume()
+            session.choose_pose()
+            self.opened, self.session = stack.pop_all(), session
+
+    def _say(self, *lines: Block | Finding) -> None:
+        self.said += [str(line) if isinstance(line, Finding) else line for line in lines]
+
+    def tell(self, text: str) -> None:
+        """Take a row or a word, as the terminal does."""
+        if (session := self.session) is not None:
+            self.said = []
+            if session.take(text):
+                session.choose_pose()
+
+    def finish(self) -> None:
+        """End measuring; the used rows become the data of the calibration."""
+        self.opened.close()
+        self.session, self.chosen.is_measured = None, self.has(SESSION)
+        self.forget()
+
+    # What a page shows
+
+    def describe(self) -> dict[str, Any]:
+        """Return everything that a page shows, but rows."""
+        program, session, shown = self.program, self.session, asdict(self.chosen)
+        shown |= {"robot": self.robot, "data": self.data, "progress": self.progress}
+        shown |= {"robots": list(list_shipped_robots()), "questions": self._list_questions()}
+        shown |= {"program": program, "most": UPLOAD_SIZE.count, "session": None}
+        shown["downloads"] = [name for name in self.list_downloads() if self.has(name)]
+        if session is not None:
+            shown["session"] = {
+                "pose": None if session.pose is None else session.task.labels[session.pose],
+                "command": session.describe_pose(session.pose) if session.pose is not None else [],
+                "headers": session.list_headers(),
+                "poses": session.task.labels,
+                "said": render_html(self.said, style=""),
+                "visits": [vars(visit) for visit in session.journal.visits],
+            }
+        return shown
+
+    def list_downloads(self) -> list[str]:
+        """Return the files that can be downloaded, if they exist."""
+        run = ("robot.yaml", "robot-not-calibrated.yaml", "result.json")
+        made = [str(self.program), *(f"report.{ending}" for ending in ("html", "pdf", "json"))]
+        made = [f"result/files/{name}" for name in made]
+        return [*made, *(f"{RUN}/{name}" for name in run), *self.data, SHEET]

@@ -1,0 +1,95 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`loopcal app` as a process, asked as by a browser or by anybody else."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+
+pytest.importorskip("tornado")
+EXAMPLE = Path(__file__).parents[2] / "examples" / "hexapod-42"
+
+
+class Server:
+    """A started `loopcal app`, whose temporary files are below `folder`."""
+
+    def __init__(self, folder: Path, *words: str) -> None:
+        folder.mkdir(exist_ok=True)
+        self.folder = folder
+        command = [sys.executable, "-m", "loopcal", "app", "--no-browser", *words]
+        self.process = subprocess.Popen(
+            command,
+            env={**os.environ, "TMPDIR": str(folder)},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        assert self.process.stdout is not None
+        self.address = self.process.stdout.readline().split()[-1]
+        self.root, _, self.token = self.address.partition("?token=")
+        self.port = int(self.root.rstrip("/").rpartition(":")[2])
+
+    def ask(
+        self, method: str, path: str, body: Any = None, headers: dict[str, str] | None = None
+    ) -> tuple[int, dict[str, str], bytes]:
+        """Return status, headers and body of an answer; by default with the token."""
+        given = {"Cookie": f"loopcal-{self.port}={self.token}"} if headers is None else headers
+        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=20)
+        body = json.dumps(body) if isinstance(body, dict) else body
+        connection.request(method, path, body, given)
+        answer = connection.getresponse()
+        read = answer.read() if path != "/events" else answer.readline()
+        connection.close()
+        return answer.status, {k.lower(): v for k, v in answer.getheaders()}, read
+
+    def tell(self, path: str, body: Any = None, method: str = "POST") -> str:
+        """Return the sentence of a refusal; empty where there is none."""
+        answer = self.ask(method, path, {} if body is None else body)[2]
+        return json.loads(answer)["error"] if answer else ""
+
+    @property
+    def state(self) -> dict[str, Any]:
+        """What a page shows now."""
+        return json.loads(self.ask("GET", "/events")[2].removeprefix(b"data: "))
+
+    def wait(self) -> dict[str, Any]:
+        """Return what a page shows when no command runs."""
+        for _ in range(600):
+            if (state := self.state)["progress"] is None:
+                return state
+            time.sleep(0.1)
+        raise AssertionError(state)
+
+    def list_children(self) -> list[psutil.Process]:
+        return psutil.Process(self.process.pid).children(recursive=True)
+
+    def end(self) -> tuple[int, str]:
+        """Ask the process to end; return its exit code and what it printed on standard error."""
+        self.process.terminate()
+        error = self.process.communicate(timeout=20)[1]
+        return self.process.returncode, error
+
+
+@pytest.fixture
+def start(tmp_path) -> Iterator[Callable[..., Server]]:
+    """Start servers, which are ended after the test."""
+    servers = []
+
+    def begin(*words: str) -> Server:
+        servers.append(Server(tmp_path / f"server{len(servers)}", *words))
+        return servers[-1]
+
+    yield begin
+    for server in servers:
+        server.process.kill()
+        server.process.communicate()

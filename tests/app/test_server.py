@@ -1,0 +1,312 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`loopcal app` as a server: who may ask, names of files, limits, and what is left at its end."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import os
+import signal
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from loopcal.app.project import Project, clean_name, recognize
+from loopcal.cli.entry_point import main
+from tests.app.conftest import EXAMPLE
+from tests.io.test_probe_reports import MARLIN, REPRAP
+
+DATA = (EXAMPLE / "measurements.csv").read_bytes()
+
+NAMES = {
+    "printer.cfg": "printer.cfg",
+    "../../etc/passwd": "passwd.txt",
+    "..\\..\\boot.ini": "boot.ini",
+    "/etc/cron.d/x.csv": "x.csv",
+    "-o.csv": "o.csv",
+    "--force": "force.txt",
+    ".bashrc": "bashrc.txt",
+    "choices": "choices.txt",
+    "result": "result.txt",
+    "a\0b\n.csv": "n.csv",
+    "C:\\Users\\x\\h\u00f6hen.csv": "h\u00f6hen.csv",
+    'a"; filename="b.csv': "b.csv",
+    "x" * 300 + ".csv": ".csv",
+}
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_name_of_a_client_becomes_a_name_inside_the_folder(name: str, tmp_path) -> None:
+    safe = clean_name(name)
+    assert NAMES[name].removesuffix(".txt") in safe
+    assert (tmp_path / safe).resolve().parent == tmp_path.resolve()
+    assert Path(safe).suffix
+    assert not safe.startswith(("-", "."))
+    assert not set(safe) & set('/\\"\0\n:<>|?*')
+    assert len(safe.encode()) < 255
+
+
+@pytest.mark.parametrize("name", ["", "..", "///", "...", "- -"])
+def test_a_name_of_nothing_is_refused(name: str) -> None:
+    with pytest.raises(Exception, match="needs a name"):
+        clean_name(name)
+
+
+KINDS = {
+    "robot.yaml": ("family: gough\n", "robot"),
+    "data.csv": ("pose,q1 [mm]\n", "data"),
+    "printer.cfg": ("[printer]\nkinematics: delta\n", "klipper"),
+    "config.g": (REPRAP, "reprap"),
+    "bed.g": ("G30 P0 X0 Y0 Z-99999\n", "log"),
+    "m503.txt": (f"echo:  {MARLIN}", "marlin"),
+    "console.log": ("G32 bed probe heights: 0.1", "log"),
+    "heightmap.csv": ("RepRapFirmware height map file v2", "log"),
+    "samples.json": ('{"motor_pos_samp": []}', "hangprinter"),
+    "plan.json": ("{}", "other"),
+    "maslow.yaml": ("Maslow_tlX: -27.6\n", "maslow"),
+    "loops.yaml": ("closed_loop: []\n", "other"),
+    "arm.urdf": ("<robot/>", "urdf"),
+    "picture.png": ("\x00\x89PNG", "log"),
+}
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_the_kind_of_a_file_is_recognized(name: str, tmp_path) -> None:
+    text, kind = KINDS[name]
+    (tmp_path / name).write_text(text)
+    assert recognize(tmp_path / name) == kind
+
+
+def test_macros_beside_a_configuration_are_logs_and_settings_stay_allowed_ones(tmp_path) -> None:
+    project = Project(tmp_path)
+    project.add("config.g", REPRAP.encode())
+    project.add("sys.g", b"M665 L1 R1\n")
+    assert project.chosen.kinds == {"config.g": "reprap", "sys.g": "log"}
+    project.change(settings={"sigma_height": "0.02mm", "--corrected": "/etc/x", "robot": "/etc"})
+    again = Project(tmp_path).chosen  # after a restart
+    assert again == project.chosen
+    words = project.calibrate()["import"]
+    assert "--sigma-height=0.02mm" in words
+    assert "--probes=sys.g" in words
+    assert not any("/etc" in word for word in words)
+
+
+def test_without_the_extra_the_command_says_how_to_install_it(monkeypatch, capsys) -> None:
+    monkeypatch.setitem(sys.modules, "tornado.web", None)
+    assert main(["app", "--no-browser"]) == 1
+    assert "pip install 'loopcal[app]'" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_only_the_page_with_the_token_is_answered(start) -> None:
+    server = start()
+    cookie = {"Cookie": f"loopcal-{server.port}={server.token}"}
+    own = f"127.0.0.1:{server.port}"
+    for headers, code in [
+        ({}, 403),
+        ({"Cookie": f"loopcal-{server.port}=wrong"}, 403),
+        ({"Cookie": "loopcal-1=wrong"}, 403),
+        (cookie, 200),
+        (cookie | {"Host": f"localhost:{server.port}"}, 200),
+        (cookie | {"Host": f"evil.example:{server.port}"}, 403),
+        (cookie | {"Host": "127.0.0.1.evil.example"}, 403),
+        (cookie | {"Host": ""}, 403),
+        (cookie | {"Origin": f"http://{own}"}, 200),
+        (cookie | {"Origin": "http://evil.example"}, 403),
+        (cookie | {"Origin": "null"}, 403),
+        (cookie | {"Origin": f"http://127.0.0.1:{server.port + 1}"}, 403),
+        (cookie | {"Host": "evil.example", "Origin": "http://evil.example"}, 403),
+    ]:
+        for method, path in [("GET", "/"), ("GET", "/rows"), ("POST", "/stop"), ("GET", "/events")]:
+            answer = server.ask(method, path, b"" if method == "POST" else None, headers)
+            assert answer[0] == code, (headers, path, answer)
+            assert "frame-ancestors 'none'" in answer[1]["content-security-policy"]
+            assert answer[1]["cache-control"] == "no-store"
+    status, headers, page = server.ask("GET", f"/?token={server.token}", headers={})
+    assert (status, page[:15]) == (200, b"<!doctype html>")
+    assert {"HttpOnly", "SameSite=Strict"} <= set(headers["set-cookie"].split("; "))
+    assert server.ask("GET", "/?token=wrong", headers={})[0] == 403
+    assert server.ask("GET", "/", headers={})[2].startswith(b"this address needs its token.")
+    assert server.end() == (0, "")
+
+
+@pytest.mark.slow
+def test_no_path_leads_out_of_the_list(start, tmp_path) -> None:
+    server = start()
+    secret = tmp_path / "secret.txt"
+    secret.write_text("secret")
+    for path in [
+        "/../secret.txt", "/..%2fsecret.txt", f"/{secret}", "//etc/passwd", "/choices", "/app.py",
+        "/result/run/../../choices", "/server.py", "/%2e%2e/%2e%2e/secret.txt", "/result/run",
+    ]:  # fmt: skip
+        status, _, body = server.ask("GET", path)
+        assert status in (400, 404), path
+        assert b"secret" not in body.replace(b"secret.txt", b"")
+    for name in ["..%2f..%2fevil.csv", "/etc/evil.csv", "%00evil.csv", "a/../../evil.csv"]:
+        assert server.tell(f"/{name}", DATA, "PUT") == ""
+    assert all(name.endswith("evil.csv") for name in server.state["kinds"])
+    folder = next(server.folder.iterdir())
+    assert {path.parent for path in folder.rglob("*evil.csv")} == {folder}
+    assert not Path("/etc/evil.csv").exists()
+    for path, body in [
+        ("/__class__", b"{}"), ("/store", b"{}"), ("/change", b"[]"), ("/change", b"{"),
+        ("/change", b'{"kinds": 1}'), ("/correct", b"\xff\xfe"),
+        ("/plan", b'{"instrument": "x", "poses": "", "accuracy": "", "sigma": ""}'),
+    ]:  # fmt: skip
+        assert server.ask("POST", path, body)[0] in (404, 500), (path, body)
+    for path, body in [
+        ("/correct", {"file": "../x", "line": 1, "column": 1, "text": ""}), ("/", {}),
+        ("/calibrate", {}), ("/measure", {}),
+    ]:  # fmt: skip
+        assert server.tell(path, body), path
+    assert server.end()[0] == 0
+
+
+@pytest.mark.slow
+def test_large_and_many_files_are_refused(start) -> None:
+    server = start()
+    connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=20)
+    connection.putrequest("PUT", "/large.csv")
+    connection.putheader("Cookie", f"loopcal-{server.port}={server.token}")
+    connection.putheader("Content-Length", str(100_000_000))
+    connection.endheaders()  # the body is not awaited
+    answer = connection.getresponse()
+    assert answer.status == 400
+    assert "the limit is 50" in json.loads(answer.read())["error"]
+    chunks = (bytes(10**6) for _ in range(60))  # of no stated length
+    with pytest.raises((OSError, AssertionError)):
+        assert server.ask("PUT", "/chunks.csv", chunks)[0] == 200
+    for i in range(50):
+        assert server.tell(f"/{i}.csv", b"pose\n", "PUT") == ""
+    assert "the limit is 50" in server.tell("/51.csv", b"pose\n", "PUT")
+    assert server.tell("/7.csv", b"pose\n", "PUT") == ""  # replaces one
+    assert len(server.state["kinds"]) == 50
+    assert server.end()[0] == 0
+
+
+def begin_work(server) -> None:
+    server.tell("/measurements.csv", DATA, "PUT")
+    server.tell("/change", {"settings": {"robot": "hexapod-42"}})
+    assert server.tell("/calibrate") == ""
+    for _ in range(50):
+        if server.list_children():
+            return
+        time.sleep(0.02)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGINT", "SIGHUP"])
+def test_an_end_during_work_leaves_no_folder_and_no_process(start, name: str) -> None:
+    server = start()
+    begin_work(server)
+    children = server.list_children()
+    assert children
+    os.kill(server.process.pid, getattr(signal, name))
+    error = server.process.communicate(timeout=20)[1]
+    assert (server.process.returncode, error) == (0, "")
+    assert list(server.folder.iterdir()) == []
+    assert not [child for child in children if child.is_running()]
+
+
+@pytest.mark.slow
+def test_work_is_stopped_and_another_waits(start) -> None:
+    server = start()
+    begin_work(server)
+    assert "Wait for its end" in server.tell("/calibrate")
+    assert "Wait for its end" in server.tell("/more.csv", b"pose\n", "PUT")
+    children = server.list_children()
+    assert server.tell("/stop") == ""
+    state = server.wait()
+    assert "calibrate" not in state["pages"]
+    assert not [child for child in children if child.is_running()]
+    assert server.tell("/stop") == ""
+    assert server.tell("/calibrate") == ""
+    assert "42 parameters" in server.wait()["pages"]["calibrate"]
+
+
+@pytest.mark.slow
+def test_a_kept_folder_is_gone_on_with(start, tmp_path) -> None:
+    words = ("--keep", str(tmp_path / "kept"))
+    first = start(*words)
+    first.tell("/measurements.csv", DATA, "PUT")
+    first.tell("/change", {"settings": {"robot": "hexapod-42"}})
+    first.tell("/leave_out", {"pose": "7", "is_out": True})
+    assert first.end() == (0, "")
+    state = start(*words).state
+    assert (state["kinds"], state["dropped"]) == ({"measurements.csv": "data"}, ["7"])
+    assert (tmp_path / "kept" / "measurements.csv").read_bytes() == DATA
+
+
+@pytest.mark.slow
+def test_an_open_network_is_warned_of(start) -> None:
+    server = start("--host", "0.0.0.0")
+    assert server.ask("GET", "/", None, {"Host": f"evil.example:{server.port}"})[0] == 403
+    assert "everyone in the network" in server.end()[1]
+
+
+@pytest.mark.slow
+def test_downloads_are_those_of_the_commands_byte_for_byte(start, tmp_path, monkeypatch) -> None:
+    from tests.cli.test_delta_page_firmware import POINTS, add_noise, make_truth, probe
+
+    folder = tmp_path / "commands"
+    folder.mkdir()
+    monkeypatch.chdir(folder)
+    Path("config.g").write_text(REPRAP)
+    robot, truth = make_truth("config.g")
+    cells = " ".join(f"{h:.3f}" for h in add_noise(probe(robot, truth, POINTS)))
+    Path("console.log").write_text(f"G32 bed probe heights: {cells}, mean 0, deviation 0")
+    points = [f"G30 P{i} X{x:.3f} Y{y:.3f} Z-99999" for i, (x, y) in enumerate(POINTS)]
+    Path("bed.g").write_text("\n".join(points) + " S-1\n")
+    server = start()
+    for name in ("config.g", "bed.g", "console.log"):
+        assert server.tell(f"/{name}", Path(name).read_bytes(), "PUT") == ""
+    assert server.tell("/change", {"settings": {"hold-out": "0.4"}}) == ""
+    assert server.tell("/calibrate") == ""
+    Path("result/files").mkdir(parents=True)
+    probes = "--probes=bed.g --probes=console.log"
+    for words in (
+        f"import config.g --format reprap -o result/config.yaml --data result/config.csv {probes}",
+        "calibrate result/config.yaml result/config.csv -o result/run --hold-out=0.4",
+        "report result/run -o result/files/report.html",
+        "export result/run --format reprap --into config.g -o result/files/config.g",
+    ):
+        assert main(words.split()) == 0
+    state = server.wait()
+    assert [m for m in state["messages"] if "note" not in m] == []
+    assert len(state["downloads"]) == 6
+    for name in state["downloads"]:
+        assert server.ask("GET", f"/{name}")[2] == Path(name).read_bytes(), name
+    assert server.ask("GET", "/result/files/config.g")[1]["content-disposition"] == (
+        'attachment; filename="config.g"'
+    )
+    shown = server.ask("GET", "/result/files/report.html?show=1")[1]
+    assert shown["content-security-policy"].startswith("sandbox allow-scripts; ")
+
+
+WRONG = {
+    "binary.csv": bytes(range(256)) * 9,
+    "empty.csv": b"",
+    "robot.csv": b"family: gough\n",
+    "other.csv": b"pose,q1 [mm],q2 [mm]\n1,2,3\n",
+}
+
+
+@pytest.mark.slow
+def test_messages_of_wrong_files_are_those_of_the_command(
+    start, tmp_path, monkeypatch, capsys
+) -> None:
+    server = start()
+    monkeypatch.chdir(tmp_path)
+    server.tell("/change", {"settings": {"robot": "five-bar"}})
+    for name, content in WRONG.items():
+        Path(name).write_bytes(content)
+        assert server.tell(f"/{name}", content, "PUT") == ""
+        assert server.tell("/calibrate") == ""
+        capsys.readouterr()
+        assert main(["calibrate", "five-bar", name, "-o", "result/run"]) == 1
+        state = server.wait()
+        assert state["messages"] == capsys.readouterr().err.splitlines()
+        assert state["codes"]["calibrate"] == 1
+        assert server.tell("/change", {"remove": name}) == ""
