@@ -23,12 +23,12 @@ def main() -> int:
 
     command = [sys.executable, "-m", "loopcal", "app", "--no-browser"]
     with (
-        subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server,
+        subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as server,
         open_renderer() as render,
     ):
-        assert server.stdout is not None
+        assert server.stderr is not None
         page = render.browser.new_page(viewport=SIZE)
-        page.goto(server.stdout.readline().split()[-1])
+        page.goto(server.stderr.readline().split()[2])
         page.set_input_files("#choose", DATA)
         page.wait_for_selector("#list li")
         page.select_option("#robot", "hexapod-42")

@@ -9,7 +9,11 @@ key vanishes or changes its meaning, FORMAT of `loopcal.cli.terminal` grows.
 
 import io
 import json
+import os
+import signal
 import sys
+import threading
+import time
 from collections.abc import Iterable, Iterator
 from contextlib import chdir, redirect_stderr, redirect_stdout
 from pathlib import Path
@@ -76,6 +80,7 @@ import printer.cfg -o printer.yaml
 import points.txt --profile own.yaml -o points.csv
 fill a.yaml plan/measurements.csv points.txt --profile own.yaml -o filled.csv
 measure plan -o session
+app --no-browser --keep kept
 study new study.yaml --robot linear-delta
 study check study.yaml --quick
 study run study.yaml -o results --quick --workers 1
@@ -148,6 +153,13 @@ def write_pictures(folder: Path) -> None:
         cv2.imwrite(str(folder / f"{i}.png"), shifted)
 
 
+def stop_app(err: io.StringIO) -> None:
+    """End `app` as Ctrl-C does, when it has printed its address."""
+    while "http://" not in err.getvalue():
+        time.sleep(0.05)
+    os.kill(os.getpid(), signal.SIGINT)
+
+
 def run_commands(lines: str = LINES) -> Iterator[tuple[str, dict[str, Any]]]:
     """Yield name and document of each command line, run in the current folder."""
     for name, text in INPUTS.items():
@@ -160,6 +172,8 @@ def run_commands(lines: str = LINES) -> Iterator[tuple[str, dict[str, Any]]]:
         if Path("e.csv").exists():  # with a noise that contradicts it
             Path("wrong.csv").write_text(Path("e.csv").read_text().replace("20 um", "0.2 um"))
         sys.stdin = io.StringIO("")  # of `measure`
+        if words[0] == "app":
+            threading.Thread(target=stop_app, args=(err,), daemon=True).start()
         with redirect_stdout(out), redirect_stderr(err):
             found = main([*words, "--json"])
         assert found == code, (line, found, out.getvalue()[-800:], err.getvalue()[-800:])

@@ -28,14 +28,13 @@ class Server:
         self.folder = folder
         command = [sys.executable, "-m", "loopcal", "app", "--no-browser", *words]
         self.process = subprocess.Popen(
-            command,
-            env={**os.environ, "TMPDIR": str(folder)},
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
+            command, env={**os.environ, "TMPDIR": str(folder)}, stderr=subprocess.PIPE, text=True
         )
-        assert self.process.stdout is not None
-        self.address = self.process.stdout.readline().split()[-1]
+        assert self.process.stderr is not None
+        self.notes = ""
+        while "http://" not in (line := self.process.stderr.readline()):
+            self.notes += line
+        self.address = line.split()[2]
         self.root, _, self.token = self.address.partition("?token=")
         self.port = int(self.root.rstrip("/").rpartition(":")[2])
 

@@ -52,8 +52,7 @@ def app(
     def announce(address: str) -> None:
         if host not in ("127.0.0.1", "::1", "localhost"):
             terminal.print_finding("app.open-network")
-        terminal.print_text(f"loopcal runs at {address}\nCtrl-C ends it.\n")
-        terminal.flush_output()
+        terminal.print_message(f"loopcal: open {address} (Ctrl-C ends it)")
         if not no_browser:
             open_page(address)
 
