@@ -92,6 +92,13 @@ def test_later_header_applies_to_the_lines_below_it(tmp_path) -> None:
     assert (found.passed, found.misfits) == (3, ())
 
 
+@pytest.mark.parametrize(("mark", "name"), [(";", "semicolon"), ("\t", "tab")])
+def test_a_header_with_another_separator_is_named(tmp_path, mark, name) -> None:
+    text = "Report\nName,X,Y,Z\n1,1,2,3\n".replace(",", mark)
+    with pytest.raises(FileError, match=rf"export.txt:2: .*\({name} in place of comma\)"):
+        convert(tmp_path, text, BY_NAME)
+
+
 def test_later_header_with_a_duplicate_column_is_refused(tmp_path) -> None:
     with pytest.raises(FileError, match=r"export.txt:3: duplicate column 'X'"):
         convert(tmp_path, "Name,X,Y,Z\n1,1,2,3\nName,X,X,Y,Z\n", BY_NAME)

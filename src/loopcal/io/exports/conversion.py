@@ -58,6 +58,7 @@ from loopcal.io.data.columns import COVARIANCE, LINK, MEASURED, NOTE, SIGMA, TIM
 from loopcal.io.data.kind_settings import KindRows, read_kinds
 from loopcal.io.data.measurement_file import FORMAT, join_tables, read_tables
 from loopcal.io.exports.profile import (
+    DELIMITERS,
     ColumnSource,
     PatternClock,
     Place,
@@ -128,6 +129,15 @@ def read_lines(
         elif not named or header is not None:
             lines.append(Line(number, cells, header))
             continue
+        for other, mark in DELIMITERS.items() if header is None else ():
+            if named <= set(map(normalize_name, _split(line, mark))):
+                finding = report_finding(
+                    "files.export-separator",
+                    profile=str(profile.file.path),
+                    found=other,
+                    wanted=record.delimiter,
+                )
+                raise FileError(finding, path, number)
         count = len(named & set(names))
         if nearest is None or count > nearest[0]:
             nearest = (count, number, names)
