@@ -177,7 +177,7 @@ BAD_EXPORTS = {
                                     ".*profile.yaml")),
     "another header": ("A;B;C\n1;2;3\n", ("export.txt:1: no line names the columns Name, X, Y, "
                                          "Z of .*profile.yaml. Correct the profile$")),
-    "other separators": (EXPORT.replace(";", "\t"), "no line names the columns"),
+    "other separators": (EXPORT.replace(";", "\t"), r"\(tab in place of semicolon\)"),
     "decimal points instead of commas": (
         "Name;X;Y;Z\nP1;1.5;2.5;3\n",
         ("export.txt:2: no line of this export fits .*profile.yaml; reason for the first one: "
