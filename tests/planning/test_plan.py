@@ -203,7 +203,7 @@ def test_text_of_a_plan_has_fewer_than_24_lines_of_sentences(planned):
     assert len(lines) < 24
     assert all(line.endswith(".") for line in lines)
     for value in (planned, planned.poses, planned.options, planned.quality, planned.errors):
-        assert len(repr(value)) < 600
+        assert len(repr(value)) < 620  # the shortest digits of a float differ with its last bit
 
 
 def test_held_out_poses_differ_from_fitted_ones_and_are_uniform_candidates(
