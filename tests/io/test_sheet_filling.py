@@ -30,6 +30,7 @@ from loopcal.io.exports.growing_export import GrowingExport, read_new_rows
 from loopcal.io.exports.profile import find_profile_file, read_profile, with_local_settings
 from loopcal.measure.instrument import Gaussian, Instrument, Sensor
 from loopcal.measure.kinds.position import Position
+from tests.findings.expectations import expect_refusal
 
 TARGETS = ("SMR1", "SMR2", "SMR3")
 N = 14
@@ -367,6 +368,17 @@ def test_filled_sheet_is_refused(robot, sheet, points, tmp_path) -> None:
     save_converted(fill(robot, sheet, path).text, tmp_path / "measured.csv")
     with pytest.raises(FileError, match="this sheet already has measured values"):
         fill(robot, tmp_path / "measured.csv", path)
+
+
+def test_a_sheet_of_several_corners_for_a_pose_is_not_called_filled(robot, tmp_path) -> None:
+    settings = "kind: image", "corners: [3, 3]", "square: 20 mm", "size: [800, 600]"
+    names = [f"{a.name} [mm]" for a in robot.actuators]
+    lines = [f"# {line}" for line in (*settings, "unknown: [camera, board, focal, center]")]
+    lines += [",".join(["pose", *names, "corner", "u [px]", "v [px]"])]
+    lines += [",".join(["1", *["0"] * 6, str(corner), "", ""]) for corner in range(2)]
+    (tmp_path / "sheet.csv").write_text("\n".join(lines) + "\n", "utf-8")
+    with expect_refusal("sheet.kinds", FileError):
+        read_sheet(tmp_path / "sheet.csv", robot)
 
 
 def test_command_prints_what_is_filled_in_and_what_is_not(

@@ -630,7 +630,8 @@ def read_sheet(path: Path, robot: Mechanism) -> tuple[Table, KindRows]:
     table = read_table(path)
     require_columns(table, ("pose",), "to join the points of an export with")
     kinds = read_kinds(table, robot)
-    if len(kinds) != 1 or kinds[0].kind.poses_per_row != 1 or "kinds" in table.settings.content:
+    one = kinds[0].kind if len(kinds) == 1 and "kinds" not in table.settings.content else None
+    if one is None or one.poses_per_row != 1 or one.label_count:
         raise FileError(report_finding("sheet.kinds", count=len(kinds)), path)
     names = [column.name for column in kinds[0].kind.columns]
     for row, cells in enumerate(zip(*(table.text(name) for name in names), strict=True)):
