@@ -25,7 +25,7 @@ class Server:
 
     def __init__(self, folder: Path, *words: str) -> None:
         folder.mkdir(exist_ok=True)
-        self.folder = folder
+        self.folder, self.host = folder, "127.0.0.1"
         command = [sys.executable, "-m", "loopcal", "app", "--no-browser", *words]
         self.process = subprocess.Popen(
             command, env={**os.environ, "TMPDIR": str(folder)}, stderr=subprocess.PIPE, text=True
@@ -43,7 +43,7 @@ class Server:
     ) -> tuple[int, dict[str, str], bytes]:
         """Return status, headers and body of an answer; by default with the token."""
         given = {"Cookie": f"loopcal-{self.port}={self.token}"} if headers is None else headers
-        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=20)
+        connection = http.client.HTTPConnection(self.host, self.port, timeout=20)
         body = json.dumps(body) if isinstance(body, dict) else body
         connection.request(method, path, body, given)
         answer = connection.getresponse()

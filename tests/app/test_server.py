@@ -157,7 +157,7 @@ def test_no_path_leads_out_of_the_list(start, tmp_path) -> None:
     ]:  # fmt: skip
         assert server.ask("POST", path, body)[0] in (404, 500), (path, body)
     for path, body in [
-        ("/correct", {"file": "../x", "line": 1, "column": 1, "text": ""}), ("/", {}),
+        ("/correct", {"file": "../x", "line": 1, "column": 1, "text": ""}), ("/nothing", {}),
         ("/calibrate", {}), ("/measure", {}),
     ]:  # fmt: skip
         assert server.tell(path, body), path
@@ -239,6 +239,29 @@ def test_a_kept_folder_is_gone_on_with(start, tmp_path) -> None:
     assert (tmp_path / "kept" / "measurements.csv").read_bytes() == DATA
 
 
+def test_a_folder_with_other_content_is_refused_and_kept(tmp_path, capsys) -> None:
+    file = tmp_path / "result" / "mine.txt"
+    file.parent.mkdir()
+    file.write_text("mine")
+    assert main(["app", "--no-browser", "--keep", str(tmp_path)]) == 1
+    assert "other content" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["result"]
+    assert file.read_text() == "mine"
+
+
+@pytest.mark.slow
+def test_names_of_all_languages_are_kept(start) -> None:
+    server = start("--host", "::1")
+    server.host = "::1"
+    name = "\u6e2c\u5b9a #1 50%.csv"
+    path = "/" + "".join(f"%{byte:02x}" for byte in name.encode())
+    assert server.tell(path, DATA, "PUT") == ""
+    assert list(server.state["kinds"]) == [name]
+    status, headers, content = server.ask("GET", path)
+    assert (status, content) == (200, DATA)
+    assert headers["content-disposition"].endswith("''%E6%B8%AC%E5%AE%9A%20%231%2050%25.csv")
+
+
 @pytest.mark.slow
 def test_an_open_network_is_warned_of(start) -> None:
     server = start("--host", "0.0.0.0")
@@ -278,9 +301,8 @@ def test_downloads_are_those_of_the_commands_byte_for_byte(start, tmp_path, monk
     assert len(state["downloads"]) == 6
     for name in state["downloads"]:
         assert server.ask("GET", f"/{name}")[2] == Path(name).read_bytes(), name
-    assert server.ask("GET", "/result/files/config.g")[1]["content-disposition"] == (
-        'attachment; filename="config.g"'
-    )
+    kept = server.ask("GET", "/result/files/config.g")[1]["content-disposition"]
+    assert kept == "attachment; filename*=UTF-8''config.g"
     shown = server.ask("GET", "/result/files/report.html?show=1")[1]
     assert shown["content-security-policy"].startswith("sandbox allow-scripts; ")
 

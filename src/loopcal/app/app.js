@@ -69,7 +69,7 @@ async function ask(path, body, method = "POST") {
 
 async function upload(files) {
   for (const file of files) {
-    if (file.size > state.most) warn(`${file.name} has ${Math.ceil(file.size / 1e6)} MB. The page takes at most ${state.most / 1e6} MB.`);
+    if (file.size > (state?.most ?? Infinity)) warn(`${file.name} has ${Math.ceil(file.size / 1e6)} MB. The page takes at most ${state.most / 1e6} MB.`);
     else if (await ask(encodeURIComponent(file.name), file, "PUT")) return;
   }
 }
@@ -107,7 +107,7 @@ function drawResult() {
   page("plan-page", state.pages.plan);
   for (const [id, name] of [["changes", "export"], ["import", "import"]]) $(id).hidden = !state.pages[name];
   draw("downloads", state.downloads, () => [
-    ...state.downloads.map((path) => h("a", { className: "button", href: encodeURI(path), download: base(path), data: { "data-key": path } },
+    ...state.downloads.map((path) => h("a", { className: "button", href: path.split("/").map(encodeURIComponent).join("/"), download: base(path), data: { "data-key": path } },
       path.startsWith("result/files/") && !NAMES[base(path)] ? `Corrected ${base(path)}` : NAMES[base(path)] ?? base(path))),
     h("button", { textContent: "Print the report to PDF", data: { "data-key": "pdf" }, onclick: () => ask("print_report") })]);
   const report = state.downloads.find((path) => path.endsWith("report.html"));
@@ -191,9 +191,9 @@ function drawSession() {
     h("button", { className: "main", textContent: "Record" })]);
   draw("words", [session.poses, session.visits.length, session.pose], () => [
     ...Object.entries(WORDS).map(([word, text]) => h("button", { type: "button", textContent: text, data: { "data-key": word },
-      disabled: word === "skip" ? session.pose === null : !session.visits.length, onclick: () => ask("tell", { text: word }) })),
+      disabled: word === "skip" ? session.pose === null : !session.visits.length, onclick: () => ask("tell", { word }) })),
     choice(Object.fromEntries([["", "Choose a pose"], ...session.poses.map((pose) => [`pose ${pose}`, `pose ${pose}`])]), "",
-      { ariaLabel: "Pose to measure next", onchange: (event) => event.target.value && ask("tell", { text: event.target.value }) })]);
+      { ariaLabel: "Pose to measure next", onchange: (event) => event.target.value && ask("tell", { word: event.target.value }) })]);
   page("said", session.said);
   $("said").className = session.visits.at(-1)?.is_used === false ? "doubt" : "";
   draw("visits", session.visits, () => {
@@ -267,8 +267,11 @@ $("sorted").onchange = drawRows;
 $("plan").onsubmit = (event) => { event.preventDefault(); ask("plan", Object.fromEntries(new FormData(event.target))); };
 $("row").onsubmit = async (event) => {
   event.preventDefault();
-  const fields = [...$("row").querySelectorAll("input")];
-  await ask("tell", { text: fields.map((field) => field.value.trim() || "-").join(" ") });
+  if ($("row").inert) return; // the values of this pose are on their way
+  const values = [...$("row").querySelectorAll("input")].map((field) => field.value.trim().replace(",", "."));
+  $("row").inert = true;
+  await ask("tell", { pose: state.session.pose, values });
+  $("row").inert = false;
   $("row").querySelector("input")?.focus();
 };
 if (location.search.includes("token")) history.replaceState(null, "", location.pathname);

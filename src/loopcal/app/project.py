@@ -40,7 +40,7 @@ from loopcal.units import DISPLAY_UNITS
 
 LONGEST = 80  # characters of the name of a file
 HEAD = 200_000  # characters by which a file is recognized
-STATE = "choices"
+STATE, REPORT = "choices", "result/files/report.html"
 RUN, SESSION, SHEET = "result/run", "session/measurements.csv", "plan/measurements.csv"
 KINDS = ("robot", "data", "log", "closures", "other")  # of files that are no program's
 FIT = ("hold-out", "noise", "loss")  # options of `calibrate`
@@ -101,9 +101,12 @@ class Project:
     """The files of one machine; `version` grows when a page is to be drawn again."""
 
     def __init__(self, folder: Path) -> None:
-        self.folder, self.state, self.version = folder, folder / STATE, 0
-        stored = read_json(self.state, "project", "remove it") if self.state.exists() else {}
-        self.chosen, self.opened = Choices(**stored), ExitStack()
+        self.folder, self.version, self.opened = folder, 0, ExitStack()
+        if any(folder.iterdir()) and not self.has(STATE):
+            raise FileError(report_finding("session.other-content"), folder)
+        known = read_json(folder / STATE, "choices", "remove it") if self.has(STATE) else {}
+        self.chosen = Choices(**known)
+        self.store()
         self.progress: tuple[str, int, int] | None = None
         self.work: asyncio.Task[None] | None = None
         self.process: asyncio.subprocess.Process | None = None
@@ -155,10 +158,8 @@ class Project:
         self.chosen.settings |= {str(key): str(value) for key, value in settings.items()}
         if known.pop(remove, None):
             (self.folder / remove).unlink(missing_ok=True)
-        if not kinds and not remove and settings.keys() <= set(FIT):
-            self._edit()
-        else:
-            self.forget()
+        is_kept = not kinds and not remove and settings.keys() <= set(FIT)
+        self.store(edits=1) if is_kept else self.forget()
 
     def forget(self) -> None:
         """Remove what was made of files that have changed."""
@@ -166,14 +167,10 @@ class Project:
         self.chosen.dropped, self.chosen.pages, self.chosen.messages = [], {}, []
         self.store()
 
-    def _edit(self) -> None:
-        """Count a change that the result does not contain."""
-        self.chosen.edits += 1
-        self.store()
-
-    def store(self) -> None:
-        """Keep what was chosen."""
-        write_text(self.state, to_json(asdict(self.chosen)))
+    def store(self, edits: int = 0) -> None:
+        """Keep what was chosen, and `edits` that the result does not contain."""
+        self.chosen.edits += edits
+        write_text(self.folder / STATE, to_json(asdict(self.chosen)))
         self.version += 1
 
     # Commands: the functions return title -> words of those to run.
@@ -182,14 +179,14 @@ class Project:
         """Read the program's file, calibrate, write the report and the corrected file."""
         steps, result, program = self._import(bool(self.data)), self.folder / "result", self.program
         self.chosen.edits, self.chosen.runs = 0, self.chosen.runs + 1
-        shutil.rmtree(result / "run", ignore_errors=True)
-        shutil.rmtree(result / "files", ignore_errors=True)
+        for name in ("run", "files"):
+            shutil.rmtree(result / name, ignore_errors=True)
         (result / "files").mkdir(parents=True)
         given = [(key, self.chosen.settings.get(key)) for key in FIT]
         options = [f"--{key}={value}" for key, value in given if value]
         options += [f"--drop={label}" for label in self.chosen.dropped]
         steps["calibrate"] = ["calibrate", self.robot, *self.data, "-o", RUN, *options]
-        steps["report"] = ["report", RUN, "-o", "result/files/report.html"]
+        steps["report"] = ["report", RUN, "-o", REPORT]
         if program and (entry := FORMATS[self.chosen.kinds[program]]).write:
             into = ["--into", program] if entry.takes_file else []
             words = ["export", RUN, "--format", entry.name, *into]
@@ -198,8 +195,7 @@ class Project:
 
     def print_report(self) -> dict[str, list[str]]:
         """Print the report to a PDF file."""
-        report = "result/files/report.html"
-        return {"report": ["report", RUN, "-o", report, "--pdf", "--force"]}
+        return {"report": ["report", RUN, "-o", REPORT, "--pdf", "--force"]}
 
     def plan(self, instrument: str, poses: str, accuracy: str, sigma: str) -> dict[str, list[str]]:
         """Plan which poses to measure."""
@@ -271,13 +267,13 @@ class Project:
 
     def stop(self) -> None:
         """End the command that runs, and what it has started."""
-        if self.work is None or self.process is None:
-            return
-        self.work.cancel()
-        with suppress(psutil.NoSuchProcess):
-            process = psutil.Process(self.process.pid)
-            for each in (*process.children(recursive=True), process):
-                each.kill()
+        if self.work is not None:
+            self.work.cancel()
+        if self.process is not None:
+            with suppress(psutil.NoSuchProcess):
+                process = psutil.Process(self.process.pid)
+                for each in (*process.children(recursive=True), process):
+                    each.kill()
 
     # Rows
 
@@ -319,13 +315,13 @@ class Project:
         lines = read_text(path, "measurement file").split("\n")
         lines[line - 1] = format_row(cells) + "\r" * lines[line - 1].endswith("\r")
         write_text(path, "\n".join(lines))
-        self._edit()
+        self.store(edits=1)
 
     def leave_out(self, pose: str, is_out: bool) -> None:
         """Leave a pose out of the next calibration, or use it again."""
         others = [each for each in self.chosen.dropped if each != pose]
         self.chosen.dropped = others + [pose] * is_out
-        self._edit()
+        self.store(edits=1)
 
     # Measuring
 
@@ -355,11 +351,11 @@ class Project:
     def _say(self, *lines: Block | Finding) -> None:
         self.said += [str(line) if isinstance(line, Finding) else line for line in lines]
 
-    def tell(self, text: str) -> None:
-        """Take a row or a word, as the terminal does."""
+    def tell(self, word: str = "", pose: str = "", values: Sequence[str] = ()) -> None:
+        """Take a word, as the terminal does, or the values of a pose."""
         if (session := self.session) is not None:
-            self.said = []
-            if session.take(text):
+            self.said, columns = [], session.journal.columns
+            if session.take(word or (pose, dict(zip(columns, values, strict=True)))):
                 session.choose_pose()
 
     def finish(self) -> None:

@@ -21,6 +21,7 @@ from itertools import count, takewhile
 from pathlib import Path
 from typing import Any
 
+from tornado.escape import url_escape
 from tornado.httpserver import HTTPServer
 from tornado.httputil import split_host_and_port
 from tornado.iostream import StreamClosedError
@@ -142,7 +143,10 @@ class Handler(RequestHandler):
             self.set_header("Content-Type", "text/html; charset=utf-8")
         else:
             self.set_header("Content-Type", "application/octet-stream")
-            self.set_header("Content-Disposition", f'attachment; filename="{file.name}"')
+            self.set_header(
+                "Content-Disposition",
+                "attachment; filename*=UTF-8''" + url_escape(file.name, plus=False),
+            )
         self.finish(file.read_bytes())
 
     async def put(self, name: str) -> None:

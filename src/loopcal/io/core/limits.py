@@ -234,20 +234,8 @@ ARRAYS_SIZE = FileLimit(
 ARRAYS_COUNT = FileLimit(
     "arrays of a run folder", 1_000, "arrays", "members of `arrays.npz`", "repeat the calibration"
 )
-UPLOAD_SIZE = FileLimit(
-    "size of a file that is given to the page",
-    50,
-    "MB",
-    "files of `loopcal app`",
-    "divide it, or use the command loopcal calibrate",
-)
-UPLOADS = FileLimit(
-    "files that are given to the page",
-    50,
-    "files",
-    "files of one machine in `loopcal app`, and machines",
-    "remove one that you no longer need",
-)
+UPLOAD_SIZE = FileLimit("size of a file of the page", 50, "MB", "`loopcal app`", "divide it")
+UPLOADS = FileLimit("files of the page", 50, "files", "`loopcal app`", "remove one")
 
 # All limits, in the order of docs/files.md.
 LIMITS = tuple(value for value in vars().values() if isinstance(value, FileLimit))
