@@ -437,6 +437,29 @@ workspace: {x: [0, 0.06], y: [-0.03, 0.03], z: [0.3, 0.34], roll: [-0.1, 0.1], p
 """  # noqa: E501
 
 
+LOADER = """format: 1
+family: stages
+name: loader
+units: {length: m, angle: rad}
+controlled: [x, z]
+couplings:
+  belt: {sum: {shoulder: 0.5, bars.a.crank: 1}, offset: 0.35, unknown: [offset], angle: {sd: 0.003}}
+stages:
+  - {name: shoulder, joint: {kind: R, axis: y, start: 0.5}}
+  - name: bars
+    mount: {x: 0.3}
+    family: limbs
+    freedoms: [x, z, ry]
+    controlled: [x]
+    home: {x: 0.1, z: 0.12}
+    limbs:
+      - {name: a, ending: rigid, attach: [-0.1, 0, 0], chain: [{joint: R, name: crank, axis: y, start: 0.1}, {joint: R, name: pin, at: [0, 0, 0.12], axis: y}], errors: [{of: pin, shift: [z], tolerance: {sd: 0.0002}}]}
+      - {name: b, ending: rigid, attach: [0.1, 0, 0], chain: [{joint: R, name: rocker, at: [0.2, 0, 0], axis: y, start: 0.1}, {joint: R, name: pin, at: [0, 0, 0.14], axis: y}]}
+  - {name: slide, joint: {kind: P, axis: x, start: 0.05, tip: [0.1, 0, 0]}}
+workspace: {x: [0.35, 0.5], z: [-0.15, -0.05]}
+"""  # noqa: E501
+
+
 def turn(axis: str, angle: Array) -> Array:
     """Return poses (n, 4, 4) turned about an axis."""
     T = np.tile(np.eye(4), (len(angle), 1, 1))
@@ -470,15 +493,31 @@ def compare_rope_table(value: dict[str, float], q: Array, T: Array) -> Array:
     return np.asarray(np.linalg.norm(gaps, axis=2) - lengths - q)
 
 
+def compare_loader(value: dict[str, float], q: Array, T: Array) -> Array:
+    """Return by how much the bars (n, 3) of LOADER are off their pins, at its slide and belt."""
+    carrier, slide = turn("y", q[:, 0]), turn("x", np.zeros(len(q)))
+    carrier[:, :3, 3] = carrier[:, :3, 0] * 0.3
+    slide[:, 0, 3] = q[:, 1] + 0.1
+    coupler = np.linalg.inv(carrier) @ T @ np.linalg.inv(slide)
+    crank = value["belt.offset"] - 0.5 * q[:, 0]
+    pin = value["bars.a.pin.z"] * np.column_stack([np.sin(crank), np.cos(crank)])
+    first, last = (coupler[:, [0, 2], 3] + x * coupler[:, [0, 2], 0] for x in (-0.1, 0.1))
+    rocker = np.linalg.norm(last - [0.2, 0.0], axis=1) - 0.14
+    return np.column_stack([first - pin, rocker])
+
+
 CHAINS = {
     "level-arm": (LEVEL_ARM, compare_level_arm),
     "rope-table": (ROPE_TABLE, compare_rope_table),
+    "loader": (LOADER, compare_loader),
 }
 
 
 @pytest.mark.parametrize("name", CHAINS)
 def test_stages_of_a_chain_are_coupled(tmp_path: Path, name: str) -> None:
-    """An arm whose belts turn its elbow, a hexapod that turns the table that carries it."""
+    """An arm whose belts turn its elbow, a hexapod that turns the table that carries it, and an arm
+    whose shoulder turns a plane linkage.
+    """
     text, compare = CHAINS[name]
     nominal = load_text(tmp_path, text)
     robot = nominal.with_values(sample_truth(nominal, 1, 1)[0])
@@ -508,6 +547,7 @@ def test_a_coupled_chain_refuses_what_it_cannot_be(tmp_path: Path) -> None:
     for old, new, sentence in (
         ("drive: none, start: -0.2, errors: [x]", "drive: none, errors: [gain]", "has no drive"),
         ("elbow.serial.joint: 0.5", "elbow.joint: 0.5", "'elbow.joint', which is neither"),
+        ("couplings:", "held: [slide]\ncouplings:", "With couplings every drive moves"),
         ("of: length, sum", "of: length, condition: temperature, sum", "does not state"),
         ("    family: gough\n", "    family: gough\n    tool: {z: 0.1}\n", "states a tool"),
     ):

@@ -140,15 +140,17 @@ def join_stages(record: Stages, stages: Sequence[AttachedStage]) -> Assembly:
 
 def couple_stages(record: Stages, chain: Assembly) -> Assembly:
     """Return the assembly of a chain with couplings between its stages as one of limbs, whose
-    bodies are the platforms of its stages; raises StageError for one with fewer than six freedoms.
+    bodies are the platforms of its stages; raises StageError for one whose limbs are not rigid and
+    which has fewer than six freedoms.
     """
     known, limbs, rest = {BASE: np.eye(4)}, list[Limb](), list(chain.limbs)
     for i, stage in enumerate(chain.stages):
         own, is_last = stage.assembly, i + 1 == len(chain.stages)
-        if len(own.freedoms) < len(AXES):
+        is_rigid = all(limb.ending == "rigid" for limb in own.limbs)
+        if len(own.freedoms) < len(AXES) and not is_rigid:
             raise StageError(
                 f"stage {stage.name!r} has the freedoms {', '.join(own.freedoms)}. In a chain with "
-                "couplings, let it have all six and limbs that hold the others",
+                "couplings, end its limbs rigid, which hold the others",
                 i,
             )
         names = {body: f"{stage.name}.{body}" for body in own.bodies}
@@ -368,8 +370,14 @@ class PlacedStages(Stages):
 
     def expand(self) -> Assembly:
         """Return the assembly of all stages; raises StageError where they do not fit together."""
+        is_coupled = bool(self.couplings) or any(name not in FORCES for name in self.conditions)
         for key, is_stated, remedy in (
             ("parameters", bool(self.parameters), "Give them in a stage that has a `family:`"),
+            (
+                "held",
+                is_coupled and bool(self.held),
+                "With couplings every drive moves. Leave it out",
+            ),
             ("home", self.home != PoseRecord(), "Give `start:` of a joint or `home:` of a stage"),
         ):
             if is_stated:
@@ -391,7 +399,6 @@ class PlacedStages(Stages):
         actuators = [a.name for stage in attached for a in stage.assembly.actuators]
         refuse_idle_drives(self.drives, actuators, map(strip_number, actuators))
         chain = join_stages(self, attached)
-        is_coupled = self.couplings or any(name not in FORCES for name in self.conditions)
         return couple_stages(self, chain) if is_coupled else chain
 
     def _expand_stage(self, i: int) -> Assembly:
