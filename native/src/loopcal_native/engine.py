@@ -408,7 +408,7 @@ class NativeFunctions:
             for a in (inputs.pattern.displacements, inputs.pattern.joints)
         ]
         taken = StepsOfLibrary(
-            *(steps.most, len(penalty), *map(len, pattern), *steps.limits),
+            *(steps.most, len(penalty), *map(len, pattern), *steps[3:-1]),
             *(locate(a) for a in (penalty, sign, *pattern, *arrays[:2])),
             calls.function,
             *(locate(deviations), locate(costs), np.inf, -1),

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from loopcal.engine import Limits
+from loopcal.engine import Steps as StepsOfEngine
 
 ABI = 11
 """The C interface that this package calls; dispatch.cpp states it, too."""
@@ -60,6 +60,8 @@ class SolvedPoses(ctypes.Structure):
 
 
 MOVE = ctypes.CFUNCTYPE(INT, ADDRESS)
+LIMITS = StepsOfEngine._fields[3:-1]
+"""Numbers by which steps end, from `widest` on."""
 
 
 class Steps(ctypes.Structure):
@@ -67,7 +69,7 @@ class Steps(ctypes.Structure):
 
     _fields_ = (
         *((name, COUNT) for name in ("most", "height", "count", "joint_count")),
-        *((name, ctypes.c_double) for name in Limits._fields),
+        *((name, ctypes.c_double) for name in LIMITS),
         *((name, ADDRESS) for name in ("penalty", "sign", "displacements", "joints", "e", "q")),
         ("move", MOVE),
         *((name, ADDRESS) for name in ("deviation", "cost")),

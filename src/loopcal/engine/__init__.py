@@ -21,7 +21,6 @@ from loopcal.engine.program import Block as Block
 from loopcal.engine.program import ClosureBlocks as ClosureBlocks
 from loopcal.engine.program import ComparedPoses as ComparedPoses
 from loopcal.engine.program import Group as Group
-from loopcal.engine.program import Limits as Limits
 from loopcal.engine.program import MapPattern as MapPattern
 from loopcal.engine.program import ParameterMap as ParameterMap
 from loopcal.engine.program import Program as Program

@@ -405,38 +405,30 @@ class ComparedPoses:
     whitener: FloatArray
 
 
-class Limits(NamedTuple):
-    """Numbers by which full steps end.
+class Steps(NamedTuple):
+    """Full Gauss-Newton steps of one trial, and when they end.
 
-    widest : residual of closure up to which a pose counts as closed [m].
+    deviation : (p,) z of e, q and their map. penalty : (k, p) P of the penalty |P z|^2.
+    most : steps. widest : residual of closure up to which a pose counts as closed [m].
     relative, absolute : a step is the last that changes the whitened residuals by this share of
         their norm, and all further ones by `further` of it, as the ratio of the last two lets
         expect, `slowest` at least from 1; or that is so long relative to 1 + |z|.
     accepted : share of the predicted decrease that a step must bring, with `rounding` of the sum.
     singular : share of |R| above which all singular values of R must certainly be.
-    """
-
-    widest: float
-    relative: float
-    absolute: float
-    further: float
-    slowest: float
-    accepted: float
-    rounding: float
-    singular: float
-
-
-class Steps(NamedTuple):
-    """Full Gauss-Newton steps of one trial, as many as `most`.
-
-    deviation : (p,) z of e, q and their map. penalty : (k, p) P of the penalty |P z|^2.
     move : from z (p,) to e, q and their map; None where the map is the same everywhere.
     """
 
     deviation: FloatArray
     penalty: FloatArray
-    most: int
-    limits: Limits
+    most: int = 0
+    widest: float = np.inf
+    relative: float = 0.0
+    absolute: float = 0.0
+    further: float = 0.0
+    slowest: float = 0.0
+    accepted: float = 0.0
+    rounding: float = 0.0
+    singular: float = 0.0
     move: Callable[[FloatArray], tuple[FloatArray, FloatArray, ParameterMap]] | None = None
 
 

@@ -12,13 +12,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cache, cached_property, partial
 from numbers import Integral
 from typing import ClassVar, NamedTuple, Protocol, Self
 
 import numpy as np
 
-from loopcal.engine import Advanced, Limits, Steps, fold
+from loopcal.engine import Advanced, Steps, fold
 from loopcal.errors import EstimationError
 from loopcal.estimate.linearization import Linearization, Start
 from loopcal.estimate.penalties import Method, decompose_for, fix_penalty
@@ -443,9 +443,9 @@ def _advance(
     advance = getattr(problem, "advance", None)
     if advance is None or (fixed := fix_penalty(method, problem.parameters)) is None:
         return None
+    most, limits = min(control.iterations, PATIENCE), (control.relative, control.absolute)
     rules = FURTHER, SLOWEST, ACCEPTED_SHARE, ROUNDING, certain_share(tolerance)
-    limits = Limits(np.inf, control.relative, control.absolute, *rules)
-    return advance(z, begin, Steps(z[0], fixed, min(control.iterations, PATIENCE), limits))
+    return advance(z, begin, Steps(z[0], fixed, most, np.inf, *limits, *rules))
 
 
 @dataclass(frozen=True, eq=False)
@@ -515,7 +515,9 @@ class _Run:
         self.status = np.where(np.isfinite(self.point.cost), running, bad).astype(int)
         self.taken = np.full(t, taken)
         self.chains = _FullSteps(self.point, taken)
-        self.damping = _Damping(t, control.damping, lambda: self.locate(at_start(), arrival))
+        self.damping = _Damping(
+            t, control.damping, lambda: self.locate(at_start(), arrival).linear_model
+        )
         self.marks = np.full((t, 3), np.inf)  # of the last progress, and evaluations since then
         self.age = np.zeros(t, dtype=np.int64)
 
@@ -632,24 +634,20 @@ class _Damping:
     """Levenberg-Marquardt damping of t trials by Nielsen's rule: working memory of one iteration.
 
     first : damping of the first step, in units of these squares.
-    locate : gives the start; its largest squared singular values scale the damping.
+    start : gives its linear model, whose largest squared singular values scale the damping.
     """
 
-    def __init__(self, trials: int, first: float, locate: Callable[[], _Point]) -> None:
-        self._locate = locate
+    def __init__(self, trials: int, first: float, start: Callable[[], LinearModel]) -> None:
+        self._start = cache(start)
         self.value: FloatArray = np.zeros(trials)
         if first:
             self.value = first * self._measure_curvature(np.arange(trials))
         self.growth: FloatArray = np.full(trials, 2.0)
         self._floor = np.full(trials, np.nan)
 
-    @cached_property
-    def _start(self) -> _Point:
-        return self._locate()
-
     def _measure_curvature(self, trials: IntArray) -> FloatArray:
         """Return the largest squared singular values (a,) of some trials."""
-        s = self._start.linear_model.take(trials).decomposition.singular_values
+        s = self._start().take(trials).decomposition.singular_values
         return s.max(axis=1, initial=0.0) ** 2
 
     def adapt(self, trials: IntArray, accepted: BoolArray, ratio: FloatArray) -> None:

@@ -325,8 +325,8 @@ class PoseRows:
             e, tau, joints = drive_joints(robot, values, q)
             return e, joints, columns.linearize(values, tau, q)
 
-        limits = steps.limits._replace(widest=WIDE * robot.size)
-        own = steps._replace(limits=limits, move=None if columns.is_constant else move)
+        moved = None if columns.is_constant else move
+        own = steps._replace(deviation=z[0], widest=WIDE * robot.size, move=moved)
         (e, joints, inputs), factor = move(z[0]), empty_factor(1, z.shape[1])
         at = robot.program, e, joints, begin.state, inputs, self.compared, own
         done = engine.fold_compared(factor, *at)

@@ -128,10 +128,6 @@ def _without_noise(rows: ObservationRows) -> ObservationRows:
     return replace(rows, measured=cleared)
 
 
-NO_STEPS = engine.Steps(np.zeros(0), np.zeros((0, 0)), 0, engine.Limits(*[0.0] * 8))
-"""Rows where a trial stands."""
-
-
 class ConsistentPoses(NamedTuple):
     """Finds poses, near given ones, at which rows have no residual.
 
@@ -322,7 +318,7 @@ class Problem:
         Nuisance parameters and uncertain poses are those that fit best there; the iteration to them
         begins at `start`.
         """
-        advanced = self.advance(deviation, start, NO_STEPS)
+        advanced = self.advance(deviation, start, engine.Steps(deviation[0], np.zeros((0, 0))))
         if advanced is not None:
             return advanced[0]
         t, known, poses, folds = len(self), None, self.poses, self.folds_plain_rows
@@ -347,8 +343,7 @@ class Problem:
         """
         if start.poses is None or len(self) != 1 or not self.folds_plain_rows:
             return None
-        own = steps._replace(deviation=deviation[0])
-        if (done := self.poses.fold_compared(deviation, start.poses, own)) is None:
+        if (done := self.poses.fold_compared(deviation, start.poses, steps)) is None:
             return None
         way, states = done
         z, cost = way.deviations[-1:], (way.factor[:, :, -1] ** 2).sum(axis=1)

@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 import loopcal as lc
 from benchmarks.peers.__main__ import make_cases
 from loopcal import engine as api
-from loopcal.engine import ComparedPoses, Limits, Steps, TwistRows
+from loopcal.engine import ComparedPoses, Steps, TwistRows
 from loopcal.estimate import pose_rows
 from loopcal.numerics.trial_batch import map_arrays
 from tests.engine.cases import draw_map
@@ -36,7 +36,7 @@ def make_arguments(name: str, n: int):
 
 def stay(p: int) -> Steps:
     """Return no step from a deviation of p parameters; any residual of closure is accepted."""
-    return Steps(np.zeros(p), np.zeros((0, p)), 0, Limits(np.inf, *[0.0] * 7))
+    return Steps(np.zeros(p), np.zeros((0, p)))
 
 
 def record_steps(case, engine, monkeypatch) -> list:
