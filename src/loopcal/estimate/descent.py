@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cache, cached_property, partial
+from functools import cached_property, partial
 from numbers import Integral
 from typing import ClassVar, NamedTuple, Protocol, Self
 
@@ -380,12 +380,14 @@ def descend(
         begin = problem.start(z) if start is None else start
         may_be_weak = ends_weak and method.unpenalized(z.shape[1]) is not None
         is_plain = arrival is None and not (sufficient or control.damping or may_be_weak)
-        way = _advance(problem, z, begin, method, control, tolerance) if is_plain else None
+        fixed = fix_penalty(method, problem.parameters)
+        way = _advance(problem, z, begin, fixed, control, tolerance) if is_plain else None
         first = way[0] if way else _linearize(problem, z, begin)
     arrival = np.full(len(z), way[1].change if way else np.inf) if arrival is None else arrival
     taken = len(way[1].costs) - 1 if way else 0
     at_start = partial(_linearize, problem, z, begin) if taken else lambda: first
-    run = _Run(problem, method, tolerance, control, sufficient, first, arrival, taken, at_start)
+    at = first, arrival, taken, at_start
+    run = _Run(problem, method, fixed, tolerance, control, sufficient, *at)
     if may_be_weak:
         is_weak = method.find_weak(run.point.linear_model.decomposition).any(axis=1)
         run.status = np.where(is_weak, DescentStatus.NO_PROGRESS.value, run.status)
@@ -433,7 +435,7 @@ def _advance(
     problem: LeastSquaresProblem,
     z: FloatArray,
     begin: Start,
-    method: Method,
+    fixed: FloatArray | None,
     control: StepControl,
     tolerance: float,
 ) -> tuple[Linearization, Advanced] | None:
@@ -441,7 +443,7 @@ def _advance(
     there, by one call of the engine; None where steps must be taken one by one.
     """
     advance = getattr(problem, "advance", None)
-    if advance is None or (fixed := fix_penalty(method, problem.parameters)) is None:
+    if advance is None or fixed is None:
         return None
     most, limits = min(control.iterations, PATIENCE), (control.relative, control.absolute)
     rules = FURTHER, SLOWEST, ACCEPTED_SHARE, ROUNDING, certain_share(tolerance)
@@ -499,6 +501,7 @@ class _Run:
         self,
         problem: LeastSquaresProblem,
         method: Method,
+        fixed: FloatArray | None,
         tolerance: float,
         control: StepControl,
         sufficient: float,
@@ -507,9 +510,8 @@ class _Run:
         taken: int,
         at_start: Callable[[], Linearization],
     ) -> None:
-        self.problem, self.method, self.tolerance = problem, method, tolerance
+        self.problem, self.method, self.fixed, self.tolerance = problem, method, fixed, tolerance
         self.control, self.sufficient = control, sufficient
-        self.fixed = fix_penalty(method, problem.parameters)
         self.point, t = self.locate(first, arrival), len(first.deviation)
         running, bad = DescentStatus.RUNNING.value, DescentStatus.BAD_START.value
         self.status = np.where(np.isfinite(self.point.cost), running, bad).astype(int)
@@ -638,16 +640,20 @@ class _Damping:
     """
 
     def __init__(self, trials: int, first: float, start: Callable[[], LinearModel]) -> None:
-        self._start = cache(start)
+        self._start = start
         self.value: FloatArray = np.zeros(trials)
         if first:
             self.value = first * self._measure_curvature(np.arange(trials))
         self.growth: FloatArray = np.full(trials, 2.0)
         self._floor = np.full(trials, np.nan)
 
+    @cached_property
+    def _model(self) -> LinearModel:
+        return self._start()
+
     def _measure_curvature(self, trials: IntArray) -> FloatArray:
         """Return the largest squared singular values (a,) of some trials."""
-        s = self._start().take(trials).decomposition.singular_values
+        s = self._model.take(trials).decomposition.singular_values
         return s.max(axis=1, initial=0.0) ** 2
 
     def adapt(self, trials: IntArray, accepted: BoolArray, ratio: FloatArray) -> None:

@@ -454,7 +454,11 @@ class PoseStates(TrialBatch):
 
 
 def spread_states(state: engine.State, trials: int, poses: int) -> engine.State:
-    """Return a state (1, 1) or (1, n) as that of all trials and poses, without copying."""
+    """Return a state (1, 1) or (1, n) as that of all trials and poses, for several trials without
+    copying.
+    """
+    if trials == 1:
+        return map_arrays(lambda a: a.repeat(poses // a.shape[1], axis=1), state)
     return map_arrays(lambda a: np.broadcast_to(a, (trials, poses, *a.shape[2:])), state)
 
 
