@@ -284,7 +284,8 @@ def simulate_trials(
         measure = partial(measure, joints=kind.stack_joints(joints, rows))
         if sight := sensor.noise.sight:
             spread = kind.spread_sight_noise(measure(np.zeros_like(noise)))
-            noise = noise + _draw_sight_noise(sight, spread, streams)
+            parts = (sd * sd * spread[name] for name, sd in sight.items())
+            noise = noise + _draw_noise(sum(parts, np.zeros(())), streams)
         columns = measure(noise)
         columns = kind.hide_unseen(seen[:, rows], columns, setup)
         if kind.label_count and not kind.detect_present(columns).any():
@@ -313,19 +314,12 @@ def simulate_trials(
     return Trials(assigned, robot.name, readings, columns, values, T, reached, nuisance, *recorded)
 
 
-def _draw_sight_noise(
-    sight: Mapping[str, float],
-    spread: Mapping[str, FloatArray],
-    streams: Sequence[np.random.Generator],
-) -> FloatArray:
-    """Return noise (t, r, m) [SI] of these covariances (t, r, m, m) per variance of each source."""
-    noise = np.zeros(())
-    for name, sd in sight.items():
-        roots = np.linalg.eigh(spread[name])  # no source has full rank
-        axes = roots.eigenvectors * np.sqrt(np.maximum(roots.eigenvalues, 0.0))[..., None, :]
-        drawn = np.stack([stream.standard_normal(axes.shape[1:3]) for stream in streams])
-        noise = noise + sd * np.einsum("trij,trj->tri", axes, drawn)
-    return noise
+def _draw_noise(covariance: FloatArray, streams: Sequence[np.random.Generator]) -> FloatArray:
+    """Return noise (t, r, m) [SI] of covariances (t, r, m, m), which may be singular."""
+    roots = np.linalg.eigh(covariance)
+    axes = roots.eigenvectors * np.sqrt(np.maximum(roots.eigenvalues, 0.0))[..., None, :]
+    drawn = np.stack([stream.standard_normal(axes.shape[1:3]) for stream in streams])
+    return np.einsum("trij,trj->tri", axes, drawn)
 
 
 def _draw_conditions(robot: Mechanism, readings: FloatArray, seed: Seed) -> FloatArray:
