@@ -299,6 +299,11 @@ def test_one_wrong_height_is_an_outlier_and_no_target_that_stands_still(capsys) 
         (REPRAP + "G31 P500 X0 Y0 Z2.1\n", 3.0, "shift of 3 mm, and differ by 0"),
         (REPRAP + "G31 P500 Z2.1\n", 0.5, "The files lack X and Y of G31"),
         (MARLIN + "M851 X0 Y0 Z1.4\n", 2.8, "twice Z1.4 of the file: its sign"),
+        (
+            MARLIN + "M851 X0 Y0 Z-1.4\n",
+            120.0,
+            "The heights reach 120 mm (from 120 mm). Are they in",
+        ),
     ],
 )
 def test_what_heights_cannot_show_of_the_probe_is_said(config, shift, words, capsys) -> None:
@@ -338,6 +343,7 @@ def test_a_terminal_may_write_times_and_directions_in_front_of_the_configuration
             "from 2026-11-30 10:15",
         ),
         ("; M500 at 2026-11-29 10:15\n", 2 * ("2026-11-30 09:40:01 ",), 0.0, ""),
+        ("; M500 at 2026-11-30T08:15\n", 2 * ("2026-11-30 09:40:01 ",), 0.0, ""),
     ],
 )
 def test_runs_that_may_belong_to_other_numbers_are_named(

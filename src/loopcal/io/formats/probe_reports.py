@@ -54,7 +54,7 @@ MOVE = re.compile(r"(?<![A-Z\d])G0*[01](?!\d)(.*)")
 TOUCHING = re.compile(r"(?<![A-Z\d])G30(?!\d)(?!.*P\s*\d).*S\s*-1(?!\d)")
 CALIBRATED = re.compile(r"Calibrated (\d+) factors using")
 HEIGHT_MAP = "RepRapFirmware height map file"
-DATE = re.compile(r"(?<!\d)20\d\d-\d\d-\d\d(?!\d)(?:[ T]\d\d:\d\d)?")
+DATE = re.compile(r"(?<!\d)20\d\d-\d\d-\d\d(?!\d)(?: \d\d:\d\d)?")
 # What only an answer of a firmware contains, not the macro or the configuration beside it.
 ANSWER = re.compile(rf"Bed X:|bed probe heights:|Stopped at height|{HEIGHT_MAP}", re.IGNORECASE)
 # Command that states where the probe is beside the nozzle, and the height at which it triggers.
@@ -99,7 +99,7 @@ def import_probes(
         finding = report_finding("files.probes-too-few", count=len(points), least=FEWEST)
         raise FileError(finding, first)
     heights = np.array([p.height for p in points])
-    stored = max(DATE.findall(read_text(path, "G-code file")), default="")
+    stored = max(DATE.findall(read_text(path, "G-code file").replace("T", " ")), default="")
     reports = (read_text(file, "probe report") for file in options.probes)
     probed = max(_list_times(reports), default="")
     if probed and stored[: len(probed)] > probed[: len(stored)]:
@@ -154,7 +154,8 @@ def read_reports(
 
 def _list_times(reports: Iterable[str]) -> list[str]:
     """Return the dates that reports state, with their times, if any."""
-    return [time for text in reports if ANSWER.search(text) for time in DATE.findall(text)]
+    answers = (text.replace("T", " ") for text in reports if ANSWER.search(text))
+    return [time for text in answers for time in DATE.findall(text)]
 
 
 def _read_probe(paths: Sequence[Path], firmware: str) -> dict[str, float]:
@@ -175,18 +176,17 @@ def check_heights(
     """Return whether all heights (n,) [mm] are shifted, with the trigger height [mm] that a file
     has; FileError where reported ones are no millimeters. Klipper's follow from motor steps.
     """
-    shift = float(np.median(heights))
-    if float(np.median(np.abs(heights - shift))) > ROUGH or abs(shift) > FARTHEST:
+    shift, noted = float(np.median(heights)), list[Finding]()
+    is_rough = float(np.median(np.abs(heights - shift))) > ROUGH
+    if is_rough or abs(shift) > FARTHEST:
         least, largest = (Quantity(float(h), "mm") for h in (heights.min(), heights.max()))
         facts = {"least": least, "largest": largest, "firmware": firmware}
-        level = Severity.WARNING if firmware == "klipper" else Severity.REFUSAL
-        finding = report_finding("files.heights-unit", level, **facts)
-        if level is Severity.REFUSAL:
-            raise FileError(finding, path)
-        return [finding]
+        if is_rough and firmware != "klipper":
+            raise FileError(report_finding("files.heights-unit", **facts), path)
+        noted.append(report_finding("files.heights-unit", Severity.WARNING, **facts))
     rest = float(np.sqrt(((heights - heights.mean()) ** 2).mean()))
     if abs(shift) < max(SHIFTED, 3.0 * rest):
-        return []
+        return noted
     trigger = (stated or 0.0) * (-1.0 if firmware == "marlin" else 1.0)
     finding = report_finding(
         "files.heights-shifted",
@@ -196,7 +196,7 @@ def check_heights(
         stated=stated,
         is_twice=abs(shift + 2.0 * trigger) < max(0.1 * abs(shift), rest),
     )
-    return [finding]
+    return [*noted, finding]
 
 
 def _compare_repeats(points: Sequence[ProbedPoint], sigma: float) -> list[Finding]:
