@@ -221,7 +221,7 @@ def build_schema(documents: list[tuple[str, dict[str, Any]]]) -> dict[str, Any]:
         "hint": texts,
     }
     finding = {
-        "code": {"type": "string", "pattern": r"^[a-z-]+\.[a-z-]+$"},
+        "code": {"type": "string", "pattern": r"^[a-z]+\.[a-z0-9-]+$"},
         "severity": {"enum": [severity.value for severity in Severity]},
         "data": {"type": "object"},
         "text": {"type": "string"},

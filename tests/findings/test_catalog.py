@@ -158,3 +158,31 @@ def test_error_made_from_a_finding_has_its_code_and_text():
     assert error.code == "fit.no-measured-value"
     assert str(error).startswith("The data contain no usable measured value")
     assert EstimationError("a sentence").code is None
+
+
+IMPERATIVES = (
+    "Add Allow Ask Avoid Begin Build Calibrate Change Check Choose Compare Compensate Compute "
+    "Continue Copy Correct Declare Delete Describe Do Draw End Enter Exclude Expand Export "
+    "Fill Find Fit Fix Free Give Hold Identify Import Inspect Install Join Keep Leave Let "
+    "Make Measure Move Name Open Plan Predict Probe Put Read Reduce Relax Remove Rename "
+    "Repeat Replace Restore Run Save Select Send Set Shorten Simulate Split Start Stop Swap "
+    "Take Train Turn Type Update Use Validate Wait Write "
+)
+# Their texts end in a list of what is allowed, or state a decision that documents repeat; or they
+# are the state of one target of many.
+WITHOUT_ACTION = {"checks.options", "conformity.fails", "files.no-example"}
+WITHOUT_ACTION |= {"compensation.outside-limits", "compensation.unreachable", "pictures.none"}
+
+
+def test_what_is_refused_or_fails_says_in_its_own_text_what_to_do() -> None:
+    """`action` is not shown with it: it only adds what the text leaves out."""
+    verbs = "|".join(IMPERATIVES.split())
+    first = rf"(?:^|[.:;(|] ?|, or |, and |\n)(?:{verbs})\b"
+    begins = rf"{first}|, (?:so |and |or |)(?:{verbs.lower()})\b"
+    silent = {
+        code
+        for code, entry in load_catalog().items()
+        if entry.severity.value in ("refusal", "failure")
+        and not re.search(begins, f"{entry.text} {entry.word_example()}")
+    }
+    assert silent == WITHOUT_ACTION

@@ -28,7 +28,7 @@ def app(
     """Calibrate and measure on a page in the browser, until Ctrl-C.
 
     Drop printer.cfg, config.g with a console log, or a robot file with measurements, and see the
-    result. Correct or leave out a row and calibrate again, download the corrected file and the
+    result. Correct or leave out a row and calibrate again. Download the corrected file and the
     report, or measure the poses of a plan with the companion.
 
     The page is for this computer only, unless --host names another address. loopcal removes its
