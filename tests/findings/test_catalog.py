@@ -163,7 +163,7 @@ def test_error_made_from_a_finding_has_its_code_and_text():
 IMPERATIVES = (
     "Add Allow Ask Avoid Begin Build Calibrate Change Check Choose Compare Compensate Compute "
     "Continue Copy Correct Declare Delete Describe Do Draw End Enter Exclude Expand Export "
-    "Fill Find Fit Fix Free Give Hold Identify Import Inspect Install Join Keep Leave Let "
+    "Fill Find Fit Fix Free Give Hold Identify Import Inspect Install Join Keep Leave Let Load "
     "Make Measure Move Name Open Plan Predict Probe Put Read Reduce Relax Remove Rename "
     "Repeat Replace Restore Run Save Select Send Set Shorten Simulate Split Start Stop Swap "
     "Take Train Turn Type Update Use Validate Wait Write "
@@ -175,7 +175,7 @@ WITHOUT_ACTION |= {"compensation.outside-limits", "compensation.unreachable", "p
 
 
 def test_what_is_refused_or_fails_says_in_its_own_text_what_to_do() -> None:
-    """`action` is not shown with it: it only adds what the text leaves out."""
+    """`action` is not shown with it. A new verb belongs to IMPERATIVES."""
     verbs = "|".join(IMPERATIVES.split())
     first = rf"(?:^|[.:;(|] ?|, or |, and |\n)(?:{verbs})\b"
     begins = rf"{first}|, (?:so |and |or |)(?:{verbs.lower()})\b"
