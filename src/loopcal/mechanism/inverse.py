@@ -445,33 +445,30 @@ def _solve_by_drives(
 
 def _make_rows(robot: Mechanism, values: FloatArray, target: FloatArray) -> _Rows:
     """Return rows with values (1 | R, p) and targets (R, c)."""
-    stages = robot.blocks
-    slots = [stage.robot.slots(values[:, stage.parameters]) for stage in stages]
-    sums = tuple(
-        list_open_sums(stage.robot, values[:, stage.parameters])
-        if stage.robot.has_open_sums or stage.robot.assembly.couplings
-        else None
-        for stage in stages
-    )
-    turns: list[bool] = []
-    for stage in stages:
-        assembly = stage.robot.assembly
+    slots, links, sums, turns = list[tuple[FloatArray, ...]](), [], [], list[bool]()
+    for stage in robot.blocks:
+        own, assembly = values[:, stage.parameters], stage.robot.assembly
+        slots.append(stage.robot.slots(own))
+        is_serial, has_sums = stage.robot.is_serial, stage.robot.has_open_sums
+        has_sums |= bool(assembly.couplings)
+        links.append(
+            place_serial(stage.robot.program.groups[0], slots[-1][0]) if is_serial else None
+        )
+        sums.append(list_open_sums(stage.robot, own) if has_sums else None)
         drives = [(name,) for name in assembly.driven_joints]
-        if stage.robot.has_open_sums or assembly.couplings:
+        if has_sums:
             drives = [actuator.driven_joints for actuator in assembly.actuators]
         drives += [()] * (len(assembly.actuators) - len(drives))  # conditions
         turns += [not assembly.turning_drives.isdisjoint(names) for names in drives]
+    e, terms = zip(*slots, strict=True)
     return _Rows(
         robot,
         values,
         target,
-        tuple(e for e, _ in slots),
-        tuple(
-            place_serial(stage.robot.program.groups[0], e) if stage.robot.is_serial else None
-            for stage, (e, _) in zip(stages, slots, strict=True)
-        ),
-        sums,
-        tuple(tau for _, tau in slots),
+        e,
+        tuple(links),
+        tuple(sums),
+        terms,
         np.zeros(len(target)),
         np.array(turns),
         measure_spans(robot, np.array(turns)),

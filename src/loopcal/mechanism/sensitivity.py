@@ -216,7 +216,7 @@ def differentiate_passive_joints(
         nodes = differentiate_pose(robot, values, q, state, nodes=len(program.nodes))
         freedoms = [6 * node + f for node, f in program.unknown_twists]
         twists = np.concatenate(nodes, axis=3)[:, :, freedoms]
-    if robot.has_open_sums:
+    if exact is not None and robot.has_open_sums:
         driven, exact = exact, None
     else:
         driven = differentiate_driven_joints(robot, values, q)

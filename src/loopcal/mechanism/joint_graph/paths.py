@@ -378,7 +378,8 @@ def find_stage_paths(
             # loops are closed in all components of twist that one of their joints can have
             own = block.graph, values, block.platform
             freedoms = list_freedoms(*own, frame, of_joints=True)
-            limbs = _keep_shifts_in_plane(*own[:2], find_limbs(*own[::2]), freedoms)
+            limbs = find_limbs(block.graph, block.platform)
+            limbs = _keep_shifts_in_plane(block.graph, values, limbs, freedoms)
             closed = LimbPaths(*own, limbs, freedoms, find_freedoms(*own))
             if closed.motions.mobility == 0:
                 raise MechanismError(report_finding("files.no-motion", platform=block.platform))
