@@ -170,7 +170,7 @@ def calibrate(
     finding = conventions.finding
     if options.choose_model and finding is not None and finding.code == "conventions.rows-far-off":
         raise DataError(report_finding("model.rows-far-off", poses=finding.data["poses"]))
-    redundant = robot.program.sigma is not None  # then readings are measurements, too
+    redundant = robot.redundancy is not None  # then readings are measurements, too
     if not split.fitted.n_rows and not redundant:
         raise DataError(report_finding("data.no-measured-value"))
     if split.held_out is not None and not split.held_out.n_rows and not redundant:

@@ -384,7 +384,7 @@ def _count_fitted_poses(fit: Identification, data: Measurements) -> int:
     """Return the number of poses that the fit uses: those with measured values; where actuators are
     redundant, all that are not excluded.
     """
-    if fit.robot.program.sigma is not None:
+    if fit.robot.redundancy is not None:
         return data.n_poses - len(fit.excluded_poses)
     is_measured = np.zeros(data.n_poses, dtype=bool)
     for rows in data.observations:

@@ -352,7 +352,7 @@ def validate(
     if unpredicted:
         pairs = zip(compared.data.observations, is_open, strict=True)
         data = replace(compared.data, observations=tuple(o.take(~of_kind) for o, of_kind in pairs))
-        if not data.n_rows and robot.program.sigma is None:
+        if not data.n_rows and robot.redundancy is None:
             raise DataError(unpredicted[0])
         compared = compare_predictions(old or robot.nominal, robot, data, kept_before, kept)
     limits = {"position": limit_position, "orientation": limit_angle}

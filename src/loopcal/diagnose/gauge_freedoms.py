@@ -344,7 +344,7 @@ def probe_readings(robot: Mechanism) -> FloatArray:
     The range shrinks until half of them are reached. Those that Newton's method does not reach from
     home are left out: following a path to each of them would take longer than all the rest.
     """
-    if robot.program.sigma is not None:
+    if robot.redundancy is not None:
         return _probe_redundant(robot)
     home = compute_readings(robot, robot.values[None], robot.home_state)[0, 0]
     spread = [

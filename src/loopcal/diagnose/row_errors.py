@@ -570,7 +570,7 @@ def compare_predictions(
     """
     counted = (o.take((o.weight > 0.0) & o.present.any(axis=1)) for o in data.observations)
     data = _take_rows(replace(data, observations=tuple(counted)), np.ones(data.n_poses, dtype=bool))
-    if not data.n_rows and after.program.sigma is None:
+    if not data.n_rows and after.redundancy is None:
         raise DataError(report_finding("residuals.no-rows-to-predict"))
     first, last = (
         _locate_poses(robot, data, setup or {})
@@ -627,7 +627,7 @@ def _locate_poses(
 ) -> _LocatedPoses:
     """Return the poses of a geometry, with setup parameters that are kept."""
     solution, known = predict_from_readings(robot, data)
-    readings = None if robot.program.sigma is None else fit_poses(robot, data)
+    readings = None if robot.redundancy is None else fit_poses(robot, data)
     nothing = np.zeros(data.n_poses, dtype=np.int64)
     if known.all() or not data.n_rows:
         return _LocatedPoses(solution, known, np.zeros_like(known), nothing, readings)

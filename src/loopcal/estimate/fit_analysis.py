@@ -293,7 +293,7 @@ class FitAnalysis:
     @cached_property
     def fitted_rows(self) -> FittedRows | None:
         """The measured rows behind the result; None where those of an earlier one are unknown."""
-        is_fitted = self.robot.program.sigma is not None
+        is_fitted = self.robot.redundancy is not None
         rows = collect_fitted_rows(self.data, are_readings_fitted=is_fitted)
         if (earlier := self.options.prior) is None:
             return rows

@@ -212,7 +212,7 @@ class TwistCoordinates(PoseCoordinates):
         super().__init__(free, names, np.zeros((1, 0, 0)))
         robot = free.robot
         drives = np.concatenate([g.actuator[g.actuator >= 0] for g in robot.program.groups])
-        if len(drives) != len(robot.actuators):
+        if len(drives) != robot.program.n_joints:
             raise EstimationError(report_finding("poses.shared-actuators", robot=robot.name))
         self.places: list[int] = list(robot.program.freedoms)
         self.count: int = len(self.places)
@@ -416,10 +416,10 @@ def first_poses(
             own = np.where(missing[chosen], solution.q[good], begin.q[chosen])
             state = map_arrays(lambda array: array[0, good], solution.state)
             begin = begin.put_poses(*chosen, PoseStates(state, own))
-        if robot.program.sigma is None and not is_full.all():
+        if robot.redundancy is None and not is_full.all():
             where = (trial[~is_full], pose[~is_full])
             begin = _begin_at_best_reading(robot, begin, missing, recorded, rows, where)
-    if robot.program.sigma is not None:
+    if robot.redundancy is not None:
         begin = _solve_redundant(robot, begin)
     if len(q) < trials:
         begin = begin.take(np.zeros(trials, dtype=np.int64))

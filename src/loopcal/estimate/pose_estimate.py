@@ -178,15 +178,15 @@ def predict_from_readings(robot: Mechanism, data: Measurements) -> tuple[Solutio
     """Return the poses of all readings, and which of them (n,) the readings determine that were
     taken and are believed. Raises DataError where a redundant reading is stated to be exact.
     """
-    if robot.program.sigma is not None:
+    if robot.redundancy is not None:
         data = fill_in_reading_sigma(robot, data)
     sigma = data.reading_sigma
-    if robot.program.sigma is None or sigma is None:
+    if robot.redundancy is None or sigma is None:
         known = np.ones(data.n_poses, dtype=bool)
         if sigma is not None:
             known = np.asarray(np.isfinite(sigma).all(axis=1))
         return forward(robot, data.readings), known
-    ratio = sigma / np.array(robot.program.sigma)
+    ratio = sigma / np.array(robot.redundancy)
     if np.isfinite(ratio).all() and np.ptp(ratio, axis=1).max() <= SAME_RATIO * ratio.min():
         solution = forward(robot, data.readings)
         if solution.converged.all():
@@ -285,7 +285,7 @@ def find_unclosed_poses(robot: Mechanism, data: Measurements) -> UnclosedPoses:
     Poses with a missing reading are not tested, and robots with as many actuators as freedoms have
     none: a pose that they do not reach is refused by `check_start`.
     """
-    if robot.program.sigma is None:
+    if robot.redundancy is None:
         return UnclosedPoses((), np.zeros(0), data.n_poses)
     used = np.flatnonzero(np.isfinite(data.readings).all(axis=1))
     if not len(used):

@@ -647,7 +647,7 @@ def _make_uncertain_rows(
     readings = ObservationRows(make_readings_kind(robot), np.arange(len(sigma)), recorded, white)
     all_rows = (*rows, readings)
     names = list_sensed_joints(r.kind for r in all_rows)
-    if robot.program.sigma is None:
+    if robot.redundancy is None:
         scale = np.where(np.isinf(sigma), UNKNOWN_READING * _reading_units(robot), sigma)
         coordinates: PoseCoordinates = ReadingCoordinates(free, names, scale)
     else:

@@ -62,7 +62,7 @@ def check_kinds(robot: Mechanism, kinds: Sequence[Kind]) -> None:
     """Refuse the kind `closure` for a robot that does not have more actuators than freedoms, and
     sensors of another dimension than their joints.
     """
-    if robot.program.sigma is None and any(kind.name == CLOSURE for kind in kinds):
+    if robot.redundancy is None and any(kind.name == CLOSURE for kind in kinds):
         counts: dict[str, Any] = {
             "actuators": len(robot.actuators),
             "freedoms": len(robot.freedoms),

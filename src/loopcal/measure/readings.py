@@ -207,7 +207,7 @@ def resolve_reading_sigma(robot: Mechanism, given: FloatArray | None, n: int) ->
             "instead"
         ),
     )
-    if robot.program.sigma is not None and np.any(given == 0.0):
+    if robot.redundancy is not None and np.any(given == 0.0):
         exact = robot.actuators[int(np.argwhere(given == 0.0)[0, 1])].name
         raise DataError(
             f"the data declare exact readings of {exact}, but {robot.name!r} has "

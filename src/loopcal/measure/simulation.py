@@ -89,7 +89,7 @@ def reach_poses(
     # Redundant actuators of a wrong geometry contradict each other: their true readings are those
     # of the reached pose. Where they contradict each other so widely that they lead to none, the
     # machine is moved to the commanded pose, with all but the needed actuators following it.
-    if robot.program.sigma is not None:
+    if robot.redundancy is not None:
         lost = state.status != Status.CONVERGED
 
         def select(placed: np.ndarray, reached: np.ndarray) -> np.ndarray:
@@ -409,7 +409,7 @@ def replace_measured_values(
     filled = replace(
         data, observations=measured.observations, base_observations=measured.base_observations
     )
-    if robot.program.sigma is None:
+    if robot.redundancy is None:
         return filled
     # redundant actuators of the true machine cannot all have the readings of the controller
     return replace(filled, readings=measured.readings, reading_sigma=measured.reading_sigma)

@@ -126,7 +126,7 @@ def differentiate_at_pose(
     robot: Mechanism, values: FloatArray, q: FloatArray, state: State
 ) -> PoseDrivenSensitivity:
     """Differentiate readings and passive joints of redundant actuators at states (t, n). Of limbs
-    with one drive and one closure row each, driven joints move by -(E de + A dy) / Q.
+    with as many drives as closure rows, driven joints move by -Q^-1 (E de + A dy).
     """
     p, m = len(robot.parameters), len(robot.freedoms)
     displacements = differentiate_displacements(robot, values)
@@ -136,14 +136,18 @@ def differentiate_at_pose(
         for limb in divide_limbs(robot.program, blocks):
             by_parameters = np.matmul(limb.E, own[:, None, limb.slots])
             both = np.concatenate([by_parameters, limb.A], axis=3)
-            with np.errstate(all="ignore"):
-                joints[rows][:, :, limb.drives] = -(both / limb.Q)
+            joints[rows][:, :, limb.drives] = -np.matmul(invert_weights(limb.Q), both)
     twists = np.broadcast_to(np.eye(m, p + m, p), (*joints.shape[:2], m, p + m))
     passive = move_passive_joints(robot, values, state, twists, joints)
-    by_inputs = differentiate_driven_joints(robot, values, q)
-    joints[..., :p] -= by_inputs[..., :p]
+    if robot.has_sums:
+        weights, moved = _differentiate_sums(robot, values, q, state)
+        joints = np.matmul(weights, joints)
+    else:
+        by_inputs = differentiate_driven_joints(robot, values, q)
+        moved = Derivatives(by_inputs[..., :p], by_inputs[..., p:])
+    joints[..., :p] -= moved.parameters
     with np.errstate(all="ignore"):
-        readings = joints / np.einsum("...jj->...j", by_inputs[..., p:])[..., None]
+        readings = joints / np.einsum("...jj->...j", moved.readings)[..., None]
     return PoseDrivenSensitivity(
         name_passive_joints(robot),
         (readings[..., :p], readings[..., p:]),

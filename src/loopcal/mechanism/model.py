@@ -416,6 +416,17 @@ class Mechanism(DrawnResult):
         )
 
     @cached_property
+    def redundancy(self) -> tuple[float, ...] | None:
+        """Relative standard deviations (a,) of readings that are more than the freedoms and each
+        of which the platform's pose determines, the largest 1; None of other robots.
+        """
+        own, program = self.assembly, self.program
+        if not self.has_redundant_sums or own.couplings or own.bodies:
+            return program.sigma
+        sigma = [row.sigma or 1.0 for row in own.rows]
+        return tuple(s / max(sigma) for s in sigma) if program.has_square_limbs else None
+
+    @cached_property
     def all_parameters(self) -> ParameterUnits:
         """All parameters in SI, as columns of derivatives."""
         count = len(self.parameters)

@@ -269,7 +269,7 @@ def _linearize_block(
     joints = list_sensed_joints(sensor.kind for sensor in mounted.sensors)
     is_redundant = (
         not by_frames
-        and robot.program.sigma is not None
+        and robot.redundancy is not None
         and resolve_reading_sigma(robot, None, 1) is not None
     )
     if is_redundant:

@@ -118,7 +118,7 @@ class Comparison:
 
 def is_redundant(free: FreeParameters) -> bool:
     """Return whether readings are rows, too: more actuators than freedoms."""
-    return free.robot.program.sigma is not None
+    return free.robot.redundancy is not None
 
 
 def select_reached(
@@ -273,7 +273,7 @@ def compute_fitted_misfit(robot: Mechanism, data: Measurements) -> float:
     where it does not converge, and for other robots. Such readings of a machine far from its file
     lead to no pose to compare.
     """
-    if robot.program.sigma is None:
+    if robot.redundancy is None:
         return np.inf
     try:
         fit = identify(robot, data.fitted)
