@@ -128,6 +128,7 @@ def test_circular_and_broken_links_are_refused(loopcal) -> None:
     ):
         loopcal(f"simulate robot.yaml -o {name} --force", sentence, code=1)
     loopcal("compensate robot.yaml circle -o new.csv", code=1)
+    loopcal(f"plan robot.yaml -o {300 * 'n'}", "name too long", code=1)
 
 
 PRINTER = """[printer]

@@ -94,6 +94,7 @@ def set_variables(variables: Mapping[str, str]) -> Iterator[None]:
     os.environ.update(variables)
     with contextlib.suppress(locale.Error):
         locale.setlocale(locale.LC_ALL, variables.get("LC_ALL", number_format))
+        locale.setlocale(locale.LC_MESSAGES, "C")  # which Python does not change
     time.tzset()
     try:
         yield

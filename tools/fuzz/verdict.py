@@ -222,7 +222,7 @@ def _judge_output(case: Case, name: str, content: bytes, may_name: bool) -> Iter
     if (kind == ".json" or not may_name) and (match := pattern.search(text)):
         near = text[max(match.start() - 80, 0) : match.end() + 40]
         yield Find("non-finite", f"{command} {kind}", f"{name}: {near}")
-    if kind == ".json" and text[:1] in ("{", "["):  # a table may have any name
+    if kind == ".json" and re.match(r"\{|\[(?![A-Z])", text):  # tables and .ini may have any name
         try:
             json.loads(text)
         except ValueError as error:

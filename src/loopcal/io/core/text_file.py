@@ -442,8 +442,8 @@ def resolve_target(path: str | Path) -> Path:
 
 
 def resolve_links(path: Path) -> Path:
-    """Return a path without links and dots; FileError for a circular link."""
-    with suppress(OSError, RuntimeError):
+    """Return a path without links and dots; FileError for a circular link, or a name too long."""
+    with report_write_errors(path), suppress(RuntimeError):
         found = path.resolve()
         if not found.is_symlink():  # Python 3.13 returns a circular link
             return found
