@@ -282,7 +282,7 @@ def test_the_companion_leads_to_a_calibration(visit, start, tmp_path) -> None:
     tab.select_option("#robot", "five-bar")
     tab.click("#planning summary")
     tab.fill("[name=sigma]", "20um")
-    tab.fill("[name=poses]", "12")
+    tab.fill("[name=poses]", "8")
     tab.click("#plan button")
     tab.click("#measure:enabled")
     tab.wait_for_selector("#companion:not([hidden])")

@@ -185,7 +185,8 @@ function drawSession() {
   if (!session) return;
   $("pose-title").textContent = session.pose === null ? "All poses are measured" : `Pose ${session.pose}`;
   const parts = session.command[0]?.split(": ").slice(1).join(": ").split(", ") ?? [];
-  draw("command", session.command, () => parts.map((part) => h("li", { textContent: part.replace("=", " = ") })));
+  $("finish").className = session.pose === null ? "main" : "";
+  draw("command", session.command, () => parts.map((part) => h("li", { textContent: part.replace(/=(-?[\d.]+)/, " = $1 ") })));
   draw("row", [session.headers, session.pose, session.visits.length], () => session.pose === null ? [] : [
     ...session.headers.map((name, i) => h("label", {}, name, h("input", { inputMode: "decimal", autocomplete: "off", data: { "data-key": `field ${i}` } }))),
     h("button", { className: "main", textContent: "Record" })]);
