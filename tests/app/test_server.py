@@ -79,6 +79,13 @@ def test_the_kind_of_a_file_is_recognized(name: str, tmp_path) -> None:
     assert recognize(tmp_path / name) == kind
 
 
+def test_what_people_did_not_name_is_not_shown(tmp_path) -> None:
+    project = Project(tmp_path)
+    assert project.word(f"{tmp_path}/plan/measurements.csv:8: wrong") == (
+        "plan/measurements.csv:8: wrong"
+    )
+
+
 def test_macros_beside_a_configuration_are_logs_and_settings_stay_allowed_ones(tmp_path) -> None:
     project = Project(tmp_path)
     project.add("config.g", REPRAP.encode())

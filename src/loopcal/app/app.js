@@ -4,7 +4,6 @@
 
 const MOST = 15; // rows of a table that are drawn at first
 const KINDS = { robot: "robot file", data: "measurements", log: "console log", closures: "loop closures", other: "only beside others" };
-const FORMATS = ["klipper", "marlin", "reprap", "linuxcnc", "urdf", "sdf", "mjcf", "hangprinter", "maslow"];
 const STEPS = { import: "Reading the file", calibrate: "Calibrating", report: "Writing the report", export: "Correcting the file", plan: "Planning" };
 const QUESTIONS = { length_unit: "Unit of lengths, such as mm", home_height: "Height of the home pose, such as 200mm", platform: "Link that is the platform" };
 const NAMES = { "robot.yaml": "Corrected robot file", "robot-not-calibrated.yaml": "Robot file (not calibrated)", "result.json": "Result (JSON)",
@@ -15,7 +14,7 @@ const ENDED = "loopcal has ended, or was started again. Open the address that it
 
 const $ = (id) => document.getElementById(id);
 const base = (path) => path.split("/").pop();
-let state = null, shown = {}, limit = MOST, rows = null;
+let state = null, shown = {}, limit = MOST, rows = null, is_wanted = false;
 
 function h(tag, props = {}, ...children) {
   const { data, ...rest } = props;
@@ -78,7 +77,7 @@ const choice = (options, value, props) => h("select", props, ...Object.entries(o
   h("option", { value: key, textContent: text, selected: key === value })));
 
 function drawFiles() {
-  const formats = Object.fromEntries(FORMATS.map((name) => [name, `file of ${name}`]));
+  const formats = Object.fromEntries(state.formats.map((name) => [name, `file of ${name}`]));
   draw("list", state.kinds, () => Object.entries(state.kinds).map(([name, kind]) => h("li", {},
     h("b", { textContent: name }),
     choice({ ...KINDS, ...formats }, kind, { ariaLabel: `Kind of ${name}`, data: { "data-key": `kind ${name}` },
@@ -183,6 +182,7 @@ function drawSession() {
   $("companion").hidden = !session;
   document.body.classList.toggle("measuring", Boolean(session));
   if (!session) return;
+  is_wanted = false;
   $("pose-title").textContent = session.pose === null ? "All poses are measured" : `Pose ${session.pose}`;
   const parts = session.command[0]?.split(": ").slice(1).join(": ").split(", ") ?? [];
   $("finish").className = session.pose === null ? "main" : "";
@@ -240,6 +240,10 @@ function drawAll() {
   drawSession();
   drawProgress();
   loadRows();
+  if (is_wanted && !state.progress && "import" in state.pages) { // the machine's file has been read
+    is_wanted = false;
+    if (!state.codes.import) ask("measure");
+  }
 }
 
 function listen() {
@@ -262,7 +266,7 @@ for (const select of document.querySelectorAll("[data-setting]"))
   select.onchange = () => ask("change", { settings: { [select.dataset.setting]: select.value } });
 $("calibrate").onclick = () => ask("calibrate");
 $("stop").onclick = () => ask("stop");
-$("measure").onclick = () => ask("measure").then((error) => error || $("pose-title").focus());
+$("measure").onclick = async () => { is_wanted = !await ask("measure"); $("pose-title").focus(); };
 $("finish").onclick = () => ask("finish").then(() => $("calibrate").focus());
 $("sorted").onchange = drawRows;
 $("plan").onsubmit = (event) => { event.preventDefault(); ask("plan", Object.fromEntries(new FormData(event.target))); };

@@ -31,11 +31,11 @@ from loopcal.io.core.csv_table import Cells, format_header, format_row, read_tem
 from loopcal.io.core.limits import UPLOAD_SIZE, UPLOADS, make_name
 from loopcal.io.core.text_file import read_json, read_text, to_json, write_text
 from loopcal.io.formats import FORMATS
-from loopcal.io.formats.import_export import recognize_format
+from loopcal.io.formats.import_export import list_formats, recognize_format
 from loopcal.io.robot.robot_file import list_shipped_robots
 from loopcal.measuring import MeasuringSession
 from loopcal.results.notebook import render_html
-from loopcal.results.tables import Block, choose_unit, format_in
+from loopcal.results.tables import Block, Table, choose_unit, format_in
 from loopcal.units import DISPLAY_UNITS
 
 LONGEST = 80  # characters of the name of a file
@@ -147,6 +147,7 @@ class Project:
         kind = recognize(self.folder / name)
         is_first = kind in KINDS or self.program in (None, name)
         kinds[name] = kind if is_first else "log"  # such as bed.g beside config.g
+        self.chosen.is_measured &= kind != "data"
         self.forget()
 
     def change(
@@ -189,8 +190,9 @@ class Project:
         steps["report"] = ["report", RUN, "-o", REPORT]
         if program and (entry := FORMATS[self.chosen.kinds[program]]).write:
             into = ["--into", program] if entry.takes_file else []
+            name = program if entry.takes_file else f"{Path(program).stem}.txt"
             words = ["export", RUN, "--format", entry.name, *into]
-            steps["export"] = [*words, "-o", f"result/files/{program}"]
+            steps["export"] = [*words, "-o", f"result/files/{name}"]
         return steps
 
     def print_report(self) -> dict[str, list[str]]:
@@ -249,6 +251,8 @@ class Project:
                 if code not in (0, 2):
                     return
         finally:
+            if self.process is not None:  # it was stopped
+                await self.process.wait()
             self.work = self.process = self.progress = None
             with suppress(OSError, FileError):  # the folder may be gone
                 self.store()
@@ -325,17 +329,22 @@ class Project:
 
     # Measuring
 
-    def measure(self) -> None:
-        """Measure the poses of the plan or of a given sheet, or go on with it."""
+    def measure(self) -> dict[str, list[str]]:
+        """Measure the poses of the plan or of a given sheet, or go on with it; first the program's
+        file is to be read.
+        """
         import loopcal as lc
         from loopcal.io.runs.session_folder import open_session
         from loopcal.measuring import prepare_session
         from loopcal.planning.companion import CompanionTask, Pace
 
         sheets = [name for name in (SHEET, *self.list_files("data")) if self.has(name)]
-        if not self.robot or not sheets:
-            missing = "sheet of a plan" if self.robot else "robot"
-            raise DataError(report_finding("app.incomplete", missing=missing))
+        if not sheets:
+            raise DataError(report_finding("app.incomplete", missing="sheet of a plan"))
+        if self.session is not None:
+            return {}
+        if steps := self._import(has_data=False):
+            return steps
         robot = lc.load_robot(self.folder / self.robot if self.has(self.robot) else self.robot)
         task, table, entry = prepare_session(
             self.folder / sheets[0], robot, None, Pace(), CompanionTask.check_every
@@ -347,9 +356,14 @@ class Project:
             session.resume()
             session.choose_pose()
             self.opened, self.session = stack.pop_all(), session
+        return {}
+
+    def word(self, text: object) -> str:
+        """Return a text without the folder, which people did not name."""
+        return str(text).replace(f"{self.folder}{os.sep}", "")
 
     def _say(self, *lines: Block | Finding) -> None:
-        self.said += [str(line) if isinstance(line, Finding) else line for line in lines]
+        self.said += [line if isinstance(line, Table) else self.word(line) for line in lines]
 
     def tell(self, word: str = "", pose: str = "", values: Sequence[str] = ()) -> None:
         """Take a word, as the terminal does, or the values of a pose."""
@@ -371,6 +385,7 @@ class Project:
         program, session, shown = self.program, self.session, asdict(self.chosen)
         shown |= {"robot": self.robot, "data": self.data, "progress": self.progress}
         shown |= {"robots": list(list_shipped_robots()), "questions": self._list_questions()}
+        shown["formats"] = list_formats("read")
         shown |= {"program": program, "most": UPLOAD_SIZE.count, "session": None}
         shown["downloads"] = [name for name in self.list_downloads() if self.has(name)]
         if session is not None:
@@ -386,7 +401,7 @@ class Project:
 
     def list_downloads(self) -> list[str]:
         """Return the files that can be downloaded, if they exist."""
+        made = sorted(path.name for path in (self.folder / "result" / "files").glob("[!.]*"))
         run = ("robot.yaml", "robot-not-calibrated.yaml", "result.json")
-        made = [str(self.program), *(f"report.{ending}" for ending in ("html", "pdf", "json"))]
-        made = [f"result/files/{name}" for name in made]
-        return [*made, *(f"{RUN}/{name}" for name in run), *self.data, SHEET]
+        folders = [f"result/files/{name}" for name in made] + [f"{RUN}/{name}" for name in run]
+        return [*folders, *self.data, SHEET]

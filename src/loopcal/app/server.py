@@ -98,11 +98,11 @@ class Handler(RequestHandler):
     def write_error(self, status_code: int, **facts: Any) -> None:
         """Answer with the sentence of an error."""
         error = facts["exc_info"][1]
-        is_ours = isinstance(error, LoopcalError)
+        is_ours, text = isinstance(error, LoopcalError), self.project.word(error)
         self.set_status(STATUS.get(error.code or "", 400) if is_ours else status_code)
         if self.request.path == "/":  # people read it
             self.set_header("Content-Type", "text/plain; charset=utf-8")
-        self.finish(str(error) if self.request.path == "/" else {"error": str(error)})
+        self.finish(text if self.request.path == "/" else {"error": text})
 
     def log_exception(self, typ: Any, value: Any, tb: Any) -> None:
         """Log defects alone."""
