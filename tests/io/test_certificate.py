@@ -334,6 +334,17 @@ def test_commands_print_facts_and_certificate(tmp_path, run, capsys) -> None:
     assert "FAMILY and -o" in capsys.readouterr().err
 
 
+def test_results_are_in_english_whatever_the_language_of_the_facts(tmp_path, run) -> None:
+    facts = write_facts(tmp_path)
+    facts.write_text(re.sub("(?m)^language: .*", "language: de", facts.read_text("utf-8")))
+    text = format_certificate(lc.load_run(run), load_administration(facts))
+    root = ElementTree.fromstring(text)
+    check_rules(root)
+    used = root.findall(".//dcc:coreData/dcc:usedLangCodeISO639_1", NAMES)
+    assert [code.text for code in used] == ["en", "de"]
+    assert read_text(root, ".//dcc:coreData/dcc:mandatoryLangCodeISO639_1") == "en"
+
+
 @pytest.mark.parametrize(("degrees", "factor"), [(np.inf, 2.45), (10.0, 2.86)])
 def test_region_of_parameters_counts_the_degrees_of_freedom(degrees, factor) -> None:
     """JCGM 102, 6.5: sqrt(2 F) of 2 and 10 degrees, sqrt(chi-square) of known noise."""

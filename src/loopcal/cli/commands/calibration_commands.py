@@ -395,7 +395,7 @@ def certificate(
 
     FACTS is a YAML file with facts outside the run: laboratory, customer, dates, serial number. The
     instruments come from the measurement files. Expanded uncertainties rest on the prior of the
-    calibration.
+    calibration, if it has one: the certificate says so.
 
     Examples:
       loopcal new --report-facts facts.yaml

@@ -200,6 +200,7 @@ def load_administration(path: str | Path, is_complete: bool = True) -> Administr
 DCC, SI = "https://ptb.de/dcc", "https://ptb.de/si"
 XSI = "http://www.w3.org/2001/XMLSchema-instance"
 VERSION = "3.3.0"
+ENGLISH = "en"  # the language of the results, whatever that of the facts
 PROBABILITY = 0.95  # coverage probability of the stated intervals
 SCOPE = (
     "The results concern the geometry in the region and under the conditions of the measured "
@@ -325,8 +326,8 @@ def _describe_administration(facts: Administration) -> Content:
     return {
         "coreData": {
             "countryCodeISO3166_1": facts.country,
-            "usedLangCodeISO639_1": facts.language,
-            "mandatoryLangCodeISO639_1": facts.language,
+            "usedLangCodeISO639_1": list(dict.fromkeys((ENGLISH, facts.language))),
+            "mandatoryLangCodeISO639_1": ENGLISH,
             "uniqueIdentifier": facts.number,
             "beginPerformanceDate": facts.begin,
             "endPerformanceDate": facts.end,
