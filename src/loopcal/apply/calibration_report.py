@@ -71,6 +71,9 @@ TOO_LITTLE_VALIDATION = {
 ALL_POSES = "outliers.all-poses"  # finding on outliers before poses were held out
 LEAVE_OUT = "values.leave-out"  # recommendation to calibrate without a wrong pose
 CHECK_FIRST = "values.check-first"  # recommendation to check what heights do not show
+# Findings that values are beyond their stated expected spreads, and the factor from which another
+# unit or order of readings is as probable.
+BEYOND_SPREADS, FAR = {"prior.tolerances-inflated", "prior.tolerances-too-narrow"}, 10.0
 # Number of poses up to which one that is wrong changes the values by more than their uncertainty.
 FEW_POSES = 50
 SEARCH_LEVEL = 0.001  # probability of excluding a pose of all where none is wrong
@@ -561,6 +564,9 @@ class CalibrationReport(DeferredFields, TableResult):
             return report_finding(LEAVE_OUT, poses=outliers)
         if advice.code.startswith("values.apply") and (checks := list_checks(self.findings)):
             return report_finding(CHECK_FIRST, **checks)
+        ratios = (f.data["ratio"] for f in self.findings if f.code in BEYOND_SPREADS)
+        if advice.code.startswith("values.apply") and (far := max(ratios, default=0.0)) > FAR:
+            return report_finding("values.check-nominal", ratio=far)
         return advice
 
     @property

@@ -597,7 +597,8 @@ def _fold_in_place(out: FloatArray, used: int, rows: FloatArray, places: IntArra
     for alike in find_distinct(size[size >= 0]):
         nodes = np.flatnonzero(size == alike)
         height = used + int(count[nodes].max())
-        for chosen in np.array_split(nodes, -(-len(nodes) * height * w * a // FOLDED)):
+        parts = min(len(nodes), -(-len(nodes) * height * w * a // FOLDED))
+        for chosen in np.array_split(nodes, parts):
             index = np.full(n, -1)
             index[chosen] = np.arange(len(chosen))
             mine = np.flatnonzero(index[places] >= 0)
