@@ -326,24 +326,25 @@ def _weigh_actuators(
     """Return relative standard deviations of redundant actuators, the largest 1; else None."""
     if assembly.couplings or len(assembly.rows) <= len(freedoms):
         return None
-    what = f"{len(assembly.rows)} actuators for {len(freedoms)} freedoms"
-    has_sums = any(row.weights for row in assembly.rows)
-    for group in () if has_sums else groups:
-        rows = len(group.rows) - len(group.unknown_joints(False))
-        driven = int((group.actuator[:, 0] >= 0).sum())
-        if rows != driven or driven != 1:
-            limb = assembly.limbs[group.limbs[0]].name
-            raise MechanismError(
-                f"{assembly.name} has {what}, and limb {limb!r} has {driven} of them and {rows} "
-                "closure equations; redundant actuation needs limbs with one of each"
-            )
     sigma = [a.sigma if a.sigma is not None else 1.0 for a in assembly.rows]
     if len({a.sigma is None for a in assembly.rows}) > 1 or min(sigma) <= 0:
         raise MechanismError(
             f"{assembly.name} has more actuators than freedoms. Give a positive sigma for every "
             "actuator, or for none"
         )
-    return None if has_sums else tuple(s / max(sigma) for s in sigma)
+    if any(row.weights for row in assembly.rows):
+        return None  # sigma weighs the sums, whatever the limbs
+    for group in groups:
+        rows = len(group.rows) - len(group.unknown_joints(False))
+        driven = int((group.actuator[:, 0] >= 0).sum())
+        if rows != driven or driven != 1:
+            limb = assembly.limbs[group.limbs[0]].name
+            raise MechanismError(
+                f"{assembly.name} has {len(assembly.rows)} actuators for {len(freedoms)} freedoms, "
+                f"and limb {limb!r} has {driven} of them and {rows} closure equations; redundant "
+                "actuation needs limbs with one of each"
+            )
+    return tuple(s / max(sigma) for s in sigma)
 
 
 def _check_compliances(assembly: Assembly, freedoms: tuple[int, ...]) -> None:
