@@ -12,7 +12,6 @@ from loopcal import engine
 from loopcal.engine import Program, State
 from loopcal.mechanism.limb_rows import (
     differentiate_displacements,
-    divide_limbs,
     expand_map,
     join_columns,
     linearize_limbs,
@@ -93,7 +92,7 @@ def list_open_sums(robot: Mechanism, values: FloatArray) -> OpenSums:
     return OpenSums(chosen, evaluate_references(tau, constants)[..., chosen:], weights)
 
 
-# Redundant actuation with a prescribed pose: readings and passive joints follow limb by limb.
+# Redundant actuation with a prescribed pose: all other joints follow.
 
 
 class PoseDrivenSensitivity(NamedTuple):
@@ -115,9 +114,13 @@ def solve_at_pose(
 
     begin : (t, n), whose joints select the branch of each limb.
     """
-    e, tau = robot.slots(values)
+    (e, tau), sums = robot.slots(values), None
     guess, limbs = driven_values(robot.program, begin), robot.program.with_fixed_platform
-    state = engine.solve(limbs, e, guess, replace(begin, T=T), free=True)
+    if robot.assembly.couplings:
+        own = list_open_sums(robot, values)
+        sums = scale_sums(robot, own.weights[:, own.chosen :], own.fixed)
+    begin = replace(begin, T=T)
+    state = engine.solve(limbs, e, guess, begin, free=sums is None, sums=sums)
     joints = driven_values(robot.program, state)
     return state, readings_from_joints(joints, tau, robot.slots.constants)
 
@@ -125,29 +128,35 @@ def solve_at_pose(
 def differentiate_at_pose(
     robot: Mechanism, values: FloatArray, q: FloatArray, state: State
 ) -> PoseDrivenSensitivity:
-    """Differentiate readings and passive joints of redundant actuators at states (t, n). Of limbs
-    with as many drives as closure rows, driven joints move by -Q^-1 (E de + A dy).
+    """Differentiate readings and passive joints of redundant actuators at states (t, n). The other
+    nodes and driven joints l follow from closure and couplings, A y + E de + Q dl = 0, dc = C dl.
     """
-    p, m = len(robot.parameters), len(robot.freedoms)
-    displacements = differentiate_displacements(robot, values)
-    joints = np.zeros((*state.T.shape[:2], robot.program.n_joints, p + m))
-    for rows, blocks in linearize_limbs(robot, values, state):
-        own = select_block(displacements, rows[:1])
-        for limb in divide_limbs(robot.program, blocks):
-            by_parameters = np.matmul(limb.E, own[:, None, limb.slots])
-            both = np.concatenate([by_parameters, limb.A], axis=3)
-            joints[rows][:, :, limb.drives] = -np.matmul(invert_weights(limb.Q), both)
-    twists = np.broadcast_to(np.eye(m, p + m, p), (*joints.shape[:2], m, p + m))
-    passive = move_passive_joints(robot, values, state, twists, joints)
+    program, p, m = robot.program, len(robot.parameters), len(robot.freedoms)
+    displacements, M = differentiate_displacements(robot, values), len(program.unknown_twists)
+    a, weights = len(robot.assembly.rows) - len(robot.assembly.couplings), np.eye(program.n_joints)
     if robot.has_sums:
         weights, moved = _differentiate_sums(robot, values, q, state)
-        joints = np.matmul(weights, joints)
     else:
         by_inputs = differentiate_driven_joints(robot, values, q)
-        moved = Derivatives(by_inputs[..., :p], by_inputs[..., p:])
-    joints[..., :p] -= moved.parameters
+        weights, moved = weights[None, None], Derivatives(by_inputs[..., :p], by_inputs[..., p:])
+    unknown = np.zeros((*state.T.shape[:2], M + program.n_joints, p + m))
+    unknown[:, :, :m, p:] = np.eye(m)
+    for rows, blocks in linearize_limbs(robot, values, state):
+        both = stack_sum_rows(program, blocks, select_block(weights, rows)[:, 0, a:])
+        opened = np.matmul(
+            stack_displacement_columns(program, blocks),
+            select_block(displacements, rows[:1])[:, None],
+        )
+        right = np.concatenate([np.zeros((*both.shape[:3], p)), both[..., :m]], axis=3)
+        right[:, :, : opened.shape[2], :p] = opened
+        right[:, :, opened.shape[2] :, :p] = -select_block(moved.parameters, rows)[:, :, a:]
+        unknown[rows][:, :, m:] = -np.matmul(invert_weights(both[..., m:]), right)
+    twists, joints = unknown[:, :, :M], unknown[:, :, M:]
+    passive = move_passive_joints(robot, values, state, twists, joints)
+    readings = np.matmul(weights[:, :, :a], joints)
+    readings[..., :p] -= moved.parameters[:, :, :a]
     with np.errstate(all="ignore"):
-        readings = joints / np.einsum("...jj->...j", moved.readings)[..., None]
+        readings /= np.einsum("...jj->...j", moved.readings[:, :, :a])[..., None]
     return PoseDrivenSensitivity(
         name_passive_joints(robot),
         (readings[..., :p], readings[..., p:]),

@@ -421,10 +421,13 @@ class Mechanism(DrawnResult):
         of which the platform's pose determines, the largest 1; None of other robots.
         """
         own, program = self.assembly, self.program
-        if not self.has_redundant_sums or own.couplings or own.bodies:
+        if not self.has_redundant_sums:
             return program.sigma
-        sigma = [row.sigma or 1.0 for row in own.rows]
-        return tuple(s / max(sigma) for s in sigma) if program.has_square_limbs else None
+        # by closure and couplings, as many as joints and other nodes have unknowns
+        equations = program.count_equations(free=True) + len(own.couplings)
+        sigma = [row.sigma or 1.0 for row in own.rows if row.column is None]
+        is_determined = equations == sum(map(len, program.others))
+        return tuple(s / max(sigma) for s in sigma) if is_determined else None
 
     @cached_property
     def all_parameters(self) -> ParameterUnits:

@@ -4,6 +4,7 @@
 from pathlib import Path
 
 import numpy as np
+import pytest
 from numpy.testing import assert_allclose
 
 from loopcal.estimate.identification import identify
@@ -171,6 +172,26 @@ workspace: {x: [-250, 250], y: [-250, 250]}
 """
 
 
+# The same machine, with winches as bodies that a coupling ties to tangent and arc.
+WINCHES = (
+    PULLEYS.replace(" sum: {c: 1}, radius: {b: 40},", "")
+    .replace(", actuated: b", "")
+    .replace(", actuated: c", "")
+    .replace(
+        "limbs:",
+        """couplings:
+  pay: {of: length, sum: {w: 1, cable.wire: -1}, radius: {cable.pulley: -40}}
+bodies: [{name: winch, copies: {count: 3}}]
+limbs:
+  - name: drum
+    to: winch
+    ending: rigid
+    copies: {count: 3}
+    chain: [{joint: P, name: slide, axis: x, actuated: w, start: 1000}]""",
+    )
+)
+
+
 def measure_cables(points: np.ndarray) -> np.ndarray:
     """Return tangents plus arcs (n, 3) [m] of points (n, 2) [m]."""
     lengths = []
@@ -184,16 +205,23 @@ def measure_cables(points: np.ndarray) -> np.ndarray:
     return np.stack(lengths, axis=1)
 
 
-def test_cables_over_pulleys_are_tangents_and_arcs(tmp_path: Path) -> None:
-    robot = load(PULLEYS, tmp_path)
+BOTH = pytest.mark.parametrize("text", [PULLEYS, WINCHES], ids=["sums", "couplings"])
+
+
+@BOTH
+def test_cables_over_pulleys_are_tangents_and_arcs(text: str, tmp_path: Path) -> None:
+    robot = load(text, tmp_path)
     points = sample_workspace(robot, POSES, 3).coordinates
     q = measure_cables(points)
     assert_allclose(inverse(robot, points).q, q, rtol=0, atol=ATOL)
     assert_allclose(forward(robot, q).T[:, :2, 3], points, rtol=0, atol=ATOL)
 
 
-def test_readings_over_pulleys_follow_the_pose_with_exact_derivatives(tmp_path: Path) -> None:
-    robot = load(PULLEYS, tmp_path)
+@BOTH
+def test_readings_over_pulleys_follow_the_pose_with_exact_derivatives(
+    text: str, tmp_path: Path
+) -> None:
+    robot = load(text, tmp_path)
     solution = sample_workspace(robot, 5, 3).solution
     values, T, step = robot.values[None], solution.state.T, 1e-6  # [m, rad]
     moved = differentiate_at_pose(robot, values, solution.q[None], solution.state)
@@ -212,8 +240,10 @@ def test_readings_over_pulleys_follow_the_pose_with_exact_derivatives(tmp_path: 
         assert_allclose(moved.readings[1][..., i], difference, rtol=0, atol=1e-8)
 
 
-def test_cables_over_pulleys_calibrate_themselves(tmp_path: Path) -> None:
-    robot = load(PULLEYS, tmp_path)
+@pytest.mark.slow
+@BOTH
+def test_cables_over_pulleys_calibrate_themselves(text: str, tmp_path: Path) -> None:
+    robot = load(text, tmp_path)
     points = sample_workspace(robot, 40, 3).coordinates
     place = Sensor(Position(), Gaussian(np.full(3, 1e-4)), rows=np.arange(6))
     instrument = Instrument((place, Sensor(Closure(), Gaussian(np.zeros(0)))))
