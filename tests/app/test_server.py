@@ -246,6 +246,17 @@ def test_a_kept_folder_is_gone_on_with(start, tmp_path) -> None:
     assert (tmp_path / "kept" / "measurements.csv").read_bytes() == DATA
 
 
+@pytest.mark.parametrize("words", ["--host no.such.name.invalid", "--host 192.0.2.1", "--port 1"])
+def test_an_address_that_is_not_ours_is_refused(words: str, monkeypatch, capsys) -> None:
+    def refuse(*_: object) -> None:
+        raise PermissionError(13, "Permission denied")
+
+    if "--port" in words:  # root may
+        monkeypatch.setattr("loopcal.app.server.bind_sockets", refuse)
+    assert main(["app", "--no-browser", *words.split()]) == 1
+    assert "does not let loopcal listen on" in capsys.readouterr().err
+
+
 def test_a_folder_with_other_content_is_refused_and_kept(tmp_path, capsys) -> None:
     file = tmp_path / "result" / "mine.txt"
     file.parent.mkdir()
@@ -329,6 +340,7 @@ def test_messages_of_wrong_files_are_those_of_the_command(
     server = start()
     monkeypatch.chdir(tmp_path)
     server.tell("/change", {"settings": {"robot": "five-bar"}})
+    assert server.tell("/numpy.py", b"raise SystemExit(7)", "PUT") == ""  # imported by nobody
     for name, content in WRONG.items():
         Path(name).write_bytes(content)
         assert server.tell(f"/{name}", content, "PUT") == ""

@@ -178,7 +178,11 @@ async def serve(folder: Path, host: str, port: int, announce: Callable[[str], No
     to open.
     """
     project, token, ended = Project(folder), secrets.token_urlsafe(24), asyncio.Event()
-    sockets = bind_sockets(port, host)
+    try:
+        sockets = bind_sockets(port, host)
+    except (OSError, UnicodeError) as error:
+        facts = {"host": host, "port": port, "reason": getattr(error, "strerror", None) or "name"}
+        raise DataError(report_finding("app.address", **facts)) from error
     port = sockets[0].getsockname()[1]
     facts = {"project": project, "token": token, "host": host.lower(), "ended": ended}
     facts |= {"cookie": f"loopcal-{port}", "lock": asyncio.Lock(), "log_function": lambda _: None}
