@@ -63,11 +63,9 @@ class Server:
 
     def wait(self) -> dict[str, Any]:
         """Return what a page shows when no command runs."""
-        for _ in range(600):
-            if (state := self.state)["progress"] is None:
-                return state
+        while (state := self.state)["progress"] is not None:
             time.sleep(0.1)
-        raise AssertionError(state)
+        return state
 
     def list_children(self) -> list[psutil.Process]:
         return psutil.Process(self.process.pid).children(recursive=True)
