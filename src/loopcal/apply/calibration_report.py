@@ -559,7 +559,8 @@ class CalibrationReport(DeferredFields, TableResult):
         advice = recommend_values(self.verdict, self.start, test, self.validation, self.findings)
         fitted = _count_fitted_poses(self.identification, self.split.fitted)
         outliers = tuple(f"pose {label}" for label in self.list_outliers(SEARCH_LEVEL))
-        is_open = advice.code.startswith(("values.apply", "values.keep-not-calibrated"))
+        open_codes = ("values.apply", "values.keep-not-calibrated", "values.keep-undecided")
+        is_open = advice.code.startswith(open_codes)
         if is_open and outliers and fitted <= FEW_POSES:
             return report_finding(LEAVE_OUT, poses=outliers)
         if advice.code.startswith("values.apply") and (checks := list_checks(self.findings)):
