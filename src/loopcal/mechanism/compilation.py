@@ -163,7 +163,7 @@ def _close_at_home(
                 value=Quantity(locked.start, SI_SYMBOLS[locked.dimension]),
             )
         )
-    weights = _weigh_actuators(assembly, groups, freedoms)
+    weights = _weigh_actuators(assembly, groups, freedoms, size)
     robot = Mechanism(
         assembly,
         table,
@@ -321,9 +321,11 @@ def _group_limbs(
 
 
 def _weigh_actuators(
-    assembly: Assembly, groups: tuple[Group, ...], freedoms: tuple[int, ...]
+    assembly: Assembly, groups: tuple[Group, ...], freedoms: tuple[int, ...], size: float
 ) -> tuple[float, ...] | None:
-    """Return relative standard deviations of redundant actuators, the largest 1; else None."""
+    """Return relative standard deviations of redundant actuators; else None. The largest, an angle
+    at the robot's size, is 1 m, so that residuals are lengths.
+    """
     if assembly.couplings or len(assembly.rows) <= len(freedoms):
         return None
     sigma = [a.sigma if a.sigma is not None else 1.0 for a in assembly.rows]
@@ -344,7 +346,9 @@ def _weigh_actuators(
                 f"and limb {limb!r} has {driven} of them and {rows} closure equations; redundant "
                 "actuation needs limbs with one of each"
             )
-    return tuple(s / max(sigma) for s in sigma)
+    turns = [a.name in assembly.turning_drives for a in assembly.rows]
+    largest = max(s * (size if turn else 1.0) for s, turn in zip(sigma, turns, strict=True))
+    return tuple(s / largest for s in sigma)
 
 
 def _check_compliances(assembly: Assembly, freedoms: tuple[int, ...]) -> None:

@@ -418,7 +418,7 @@ class Mechanism(DrawnResult):
     @cached_property
     def redundancy(self) -> tuple[float, ...] | None:
         """Relative standard deviations (a,) of readings that are more than the freedoms and each
-        of which the platform's pose determines, the largest 1; None of other robots.
+        of which the platform's pose determines; None of other robots.
         """
         own, program = self.assembly, self.program
         if not self.has_redundant_sums:

@@ -255,3 +255,35 @@ def test_cables_over_pulleys_calibrate_themselves(text: str, tmp_path: Path) -> 
         z.append((fit.estimate - truth) / fit.standard_deviations)
     # 20 machines of 9 parameters: three standard deviations of their rms, 0.053
     assert_allclose(np.sqrt(np.mean(np.square(z))), 1.0, rtol=0, atol=0.16)
+
+
+# A planar robot with a redundant fourth leg.
+FOUR_LEGS = """
+format: 1
+family: limbs
+name: four-legs
+units: {length: mm, angle: deg}
+freedoms: [x, y, rz]
+controlled: [x, y, yaw]
+drives:
+  q: {reads: angle, sigma: 0.005, unknown: [offset], angle: {sd: 0.3}}
+limbs:
+  - name: leg
+    copies: {count: 4}
+    chain: [{joint: R, name: motor, at: {x: 320, yaw: 130}, actuated: q}]
+    tip: [200, 0, 0]
+    ending: distance
+    length: 190
+    attach: [70, 10, 0]
+"""
+
+
+def test_gaps_of_redundant_motors_are_lengths(tmp_path: Path) -> None:
+    offsets = np.deg2rad([[0.24, -0.24, 0.24, -0.24]])  # contradict each other
+    small, large = (load(FOUR_LEGS.replace("mm", unit), tmp_path) for unit in ("mm", "in"))
+    homes = [inverse(robot, robot.home[None]).q for robot in (small, large)]
+    assert_allclose(homes[0], homes[1], rtol=0, atol=ATOL)
+    ends = [forward(robot, homes[0] + offsets) for robot in (small, large)]
+    assert all(end.converged.all() for end in ends)
+    assert_allclose(ends[1].residual, 25.4 * ends[0].residual, rtol=1e-9)
+    assert ends[0].residual[0] < 4 * 0.2 * np.deg2rad(0.24) * 3  # [m], cranks of 0.2 m
