@@ -261,7 +261,7 @@ def test_a_lost_connection_is_said_and_typed_values_stay(visit, start, tmp_path)
     tab.wait_for_selector("#alert:not(:empty)")
     assert "does not answer" in tab.inner_text("#alert")
     tab.context.set_offline(False)
-    tab.wait_for_selector("#alert", state="attached")
+    tab.wait_for_selector("#alert:empty", state="attached")  # when the server is heard again
     assert tab.input_value("[name=sigma]") == "7um"
     server.end()
     tab.wait_for_selector("#alert:not(:empty)")

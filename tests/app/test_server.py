@@ -11,6 +11,7 @@ import sys
 import time
 from pathlib import Path
 
+import psutil
 import pytest
 
 from loopcal.app.project import Project, clean_name, recognize
@@ -285,6 +286,10 @@ def test_an_open_network_is_warned_of(start) -> None:
     server = start("--host", "0.0.0.0")
     assert server.ask("GET", "/", None, {"Host": f"evil.example:{server.port}"})[0] == 403
     assert "everyone in the network" in server.notes
+    server.host = server.root.split("/")[2].rpartition(":")[0]
+    listed = [each.address for of in psutil.net_if_addrs().values() for each in of]
+    assert server.host in listed or not any(a.count(".") == 3 and a[:4] != "127." for a in listed)
+    assert server.ask("GET", "/")[0] == 200
 
 
 @pytest.mark.slow

@@ -12,6 +12,7 @@ from __future__ import annotations
 import asyncio
 import hmac
 import json
+import re
 import secrets
 import signal
 from collections.abc import Callable
@@ -21,6 +22,7 @@ from itertools import count, takewhile
 from pathlib import Path
 from typing import Any
 
+import psutil
 from tornado.escape import url_escape
 from tornado.httpserver import HTTPServer
 from tornado.httputil import split_host_and_port
@@ -34,7 +36,7 @@ from loopcal.findings import report_finding
 from loopcal.io.core.limits import UPLOAD_SIZE
 from loopcal.io.core.text_file import to_json
 
-TICK, HEARTBEAT = 0.1, 50  # seconds between looks; looks after which a page is told all again
+TICK, HEARTBEAT = 0.1, 30  # seconds between looks; looks after which a page is told all again
 HEADERS = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src "
     "'self' data:; connect-src 'self'; frame-src 'self'; form-action 'none'; base-uri 'none'; "
@@ -192,6 +194,9 @@ async def serve(folder: Path, host: str, port: int, announce: Callable[[str], No
         with suppress(AttributeError, NotImplementedError):  # on Windows, Ctrl-C interrupts
             asyncio.get_running_loop().add_signal_handler(getattr(signal, name), ended.set)
     shown = f"[{host}]" if ":" in host else host
+    if host == "0.0.0.0":  # all addresses, of which a tablet needs one
+        listed = (each.address for of in psutil.net_if_addrs().values() for each in of)
+        shown = next((a for a in listed if re.fullmatch(r"(?!127\.)[\d.]+", a)), host)
     announce(f"http://{shown}:{port}/?token={token}")
     try:
         await ended.wait()
