@@ -27,6 +27,7 @@ from loopcal.cli.entry_point import main
 from loopcal.findings import Severity
 from loopcal.io.file_schemas import DIALECT
 from loopcal.io.pictures import choose_board
+from loopcal.results.result import Result
 
 SCHEMA = Path(__file__).parents[1] / "src" / "loopcal" / "cli" / "output.schema.json"
 POSITION = "--kind position --sigma-position 20um"
@@ -52,6 +53,9 @@ calibrate a.yaml d.csv -o may --limit-position 1mm {VOLUME}
 calibrate a.yaml e.csv -o chosen --choose-model
 calibrate a.yaml e.csv -o june --hold-out 0.25
 calibrate a.yaml e.csv --noise estimated --method least-squares
+calibrate a.yaml e.csv --prior may --compare truth.yaml
+simulate truth.yaml --draw 20 --kind component --components z -o z.csv
+calibrate a.yaml z.csv --method least-squares
 calibrate hexapod-42 hexapod-42/measurements.csv -o hexapod
 2 calibrate a.yaml wrong.csv -o failed
 2 compensate failed targets.csv
@@ -62,6 +66,7 @@ validate may e.csv
 validate truth.yaml e.csv --limit-position 1mm
 simulate truth.yaml --poses visits.csv --kind position -o visited.csv
 repeatability truth.yaml visited.csv
+calibrate a.yaml visited.csv --allow-duplicates
 accuracy may {VOLUME}
 budget may
 compare may june
@@ -235,11 +240,12 @@ def build_schema(documents: list[tuple[str, dict[str, Any]]]) -> dict[str, Any]:
         "finding": describe_object(finding, finding),
         "error": describe_object({**numbered, "error": describe_object(error, error)}, ["error"]),
     }
+    optional = list_optional_keys(Result)
     for name in dict.fromkeys(name for name, _ in documents):
         of = [document for command, document in documents if command == name]
         keys = list(dict.fromkeys(key for document in of for key in document if key not in shared))
         own = {key: describe_key([d[key] for d in of if key in d]) for key in keys}
-        needed = [key for key in keys if all(key in document for document in of)]
+        needed = [key for key in keys if all(key in d for d in of) and key not in optional]
         definitions[name] = describe_object({**own, **numbered, **shared}, needed)
     return {
         "$schema": DIALECT,
@@ -248,6 +254,13 @@ def build_schema(documents: list[tuple[str, dict[str, Any]]]) -> dict[str, Any]:
         "run. A refusal (exit code 1) and a defect (exit code 3) are #/$defs/error.",
         "$defs": definitions,
     }
+
+
+def list_optional_keys(base: type[Result]) -> set[str | None]:
+    """Return the keys that results leave out where there is nothing to state."""
+    kinds = base.__subclasses__()
+    own = {field.json_key for kind in kinds for field in kind.FIELDS if field.is_optional}
+    return own.union(*map(list_optional_keys, kinds))
 
 
 def describe_object(keys: dict[str, Any], needed: Iterable[str]) -> dict[str, Any]:
