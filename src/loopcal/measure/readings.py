@@ -86,23 +86,14 @@ def select_joint_values(
     readings : (t or 1, n, a) [SI]. state : of t trials and n poses.
     """
     actuators = [actuator.name for actuator in robot.actuators]
-    limbs = robot.assembly.limbs
-    places = {
-        f"{limbs[limb].name}.{joint.name}": (g, k, j)
-        for g, group in enumerate(robot.program.groups)
-        for k, limb in enumerate(group.limbs)
-        for j, joint in enumerate(limbs[limb].joints)
-    }
     passive = {f"{limb.name}.{joint.name}" for limb, joint in robot.assembly.passive_joints}
-    passive = {name: place for name, place in places.items() if name in passive}
     entries = select_platform_entries(robot, state) if robot.stages else {}
     values = {}
     for name in names:
         if name in actuators:
             values[name] = readings[..., actuators.index(name)]
         elif name in passive:
-            group, limb, joint = passive[name]
-            values[name] = state.joints[group][:, :, limb, joint]
+            values[name] = robot.select_joint(state, name)
         elif name in entries:
             values[name] = entries[name]
         elif ":" in name:

@@ -374,6 +374,21 @@ class Mechanism(DrawnResult):
         """Whether the pose is the product of driven joints: one limb without passive joints."""
         return is_serial(self.assembly) and not self.has_open_sums
 
+    def select_joint(self, state: State, name: str) -> FloatArray:
+        """Return the values (t, n) of a joint `limb.joint` [rad or m]."""
+        group, k, j = self._joint_places[name]
+        return state.joints[group][:, :, k, j]
+
+    @cached_property
+    def _joint_places(self) -> Mapping[str, tuple[int, int, int]]:
+        """Group, limb in it and joint of each joint `limb.joint`."""
+        return {
+            f"{limb.name}.{joint.name}": (g, k, j)
+            for g, group in enumerate(self.program.groups)
+            for k, limb in enumerate(self.assembly.limbs[i] for i in group.limbs)
+            for j, joint in enumerate(limb.joints)
+        }
+
     @cached_property
     def joint_units(self) -> FloatArray:
         """Lengths (J,) [m] that a unit of each driven joint counts for, an angle at the size."""

@@ -528,17 +528,11 @@ def are_poses(robot: Mechanism, targets: ArrayLike) -> bool:
 def make_solution(robot: Mechanism, state: State, q: FloatArray) -> Solution:
     """Return the solution of a state (1, n) with readings (n, a)."""
     names = name_passive_joints(robot)
-    place, passive = {name: i for i, name in enumerate(names)}, np.zeros((len(q), len(names)))
-    for group, joints in zip(robot.program.groups, state.joints, strict=True):
-        for k, limb in enumerate(robot.assembly.limbs[i] for i in group.limbs):
-            for j, joint in enumerate(limb.joints):
-                column = place.get(f"{limb.name}.{joint.name}")
-                if column is not None:
-                    passive[:, column] = joints[0, :, k, j]
+    passive = [robot.select_joint(state, name)[0] for name in names]
     return Solution(
         state.T[0],
         q,
-        passive,
+        np.reshape(passive, (len(names), len(q))).T,
         names,
         state.status[0],
         state.residual[0],

@@ -57,13 +57,12 @@ def evaluate_limits(
         for i, a in enumerate(robot.actuators)
         if a.stroke is not None
     ]
-    for group, joints in zip(robot.program.groups, state.joints, strict=True):
-        for k, i in enumerate(group.limbs):
-            limb = robot.assembly.limbs[i]
-            for j, joint in enumerate(limb.joints):
-                if joint.limits is not None:
-                    name, value = f"{limb.name}.{joint.name}", joints[:, :, k, j]
-                    limits.append(Limit(name, joint.dimension, *joint.limits, value))
+    for limb in robot.assembly.limbs:
+        for joint in limb.joints:
+            if joint.limits is not None:
+                name = f"{limb.name}.{joint.name}"
+                value = robot.select_joint(state, name)
+                limits.append(Limit(name, joint.dimension, *joint.limits, value))
     if any(limb.cones for limb in robot.assembly.limbs):
         all_frames = compute_limb_frames(robot, values, state)
         for limb, frames in zip(robot.assembly.limbs, all_frames, strict=True):
