@@ -272,3 +272,10 @@ def test_last_matching_noise_pattern_applies_to_a_column(tmp_path, robot) -> Non
     )
     with pytest.raises(LoopcalError, match=r"data.csv:3: unknown key 'y\*' in 'noise'"):
         load_measurements(write(tmp_path, GOOD.replace("z: 1 um", '"y*": 1 um')), robot)
+
+
+def test_a_noise_of_a_column_of_every_target_is_answered_by_its_pattern(tmp_path, robot) -> None:
+    text = GOOD.replace("kind: component", "kind: position\n# targets: [a, b]")
+    text = "\n".join(line for line in text.splitlines() if "components" not in line) + "\n"
+    with pytest.raises(LoopcalError, match=r"unknown key 'x' in 'noise'.* \*\.x, a\.x"):
+        load_measurements(write(tmp_path, text.replace("z: 1 um", "x: 1 um")), robot)

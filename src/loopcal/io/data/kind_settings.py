@@ -230,7 +230,8 @@ def match_names(
         matching = [name for name in names if fnmatchcase(name, pattern)]
         matching = [pattern] if pattern in names else matching
         if not matching:
-            refuse_unknown_keys(file, [pattern], names, place)
+            of_all = [f"*.{pattern}" for name in names if name.endswith(f".{pattern}")]
+            refuse_unknown_keys(file, [pattern], [*of_all[:1], *names], place)
         yield node, matching, (*place, pattern)
 
 
