@@ -23,10 +23,11 @@ EXAMPLE = Path(__file__).parents[2] / "examples" / "hexapod-42"
 class Server:
     """A started `loopcal app`, whose temporary files are below `folder`."""
 
-    def __init__(self, folder: Path, *words: str) -> None:
+    def __init__(self, folder: Path, *words: str, browser: bool = False) -> None:
         folder.mkdir(exist_ok=True)
         self.folder, self.host = folder, "127.0.0.1"
-        command = [sys.executable, "-m", "loopcal", "app", "--no-browser", *words]
+        command = [sys.executable, "-m", "loopcal", "app", *words]
+        command += [] if browser else ["--no-browser"]
         self.process = subprocess.Popen(
             command, env={**os.environ, "TMPDIR": str(folder)}, stderr=subprocess.PIPE, text=True
         )
@@ -82,8 +83,8 @@ def start(tmp_path) -> Iterator[Callable[..., Server]]:
     """Start servers, which are ended after the test."""
     servers = []
 
-    def begin(*words: str) -> Server:
-        servers.append(Server(tmp_path / f"server{len(servers)}", *words))
+    def begin(*words: str, browser: bool = False) -> Server:
+        servers.append(Server(tmp_path / f"server{len(servers)}", *words, browser=browser))
         return servers[-1]
 
     yield begin

@@ -141,6 +141,23 @@ def test_only_the_page_with_the_token_is_answered(start) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.skipif(sys.platform == "win32", reason="a script stands for the browser")
+def test_the_address_of_the_started_browser_opens_once(start, tmp_path, monkeypatch) -> None:
+    script, seen = tmp_path / "browser", tmp_path / "seen"
+    script.write_text(f'#!/bin/sh\necho "$1" > {seen}.part && mv {seen}.part {seen}\n')
+    script.chmod(0o700)
+    monkeypatch.setenv("BROWSER", str(script))
+    monkeypatch.setenv("DISPLAY", ":0")
+    server = start(browser=True)
+    while not seen.exists():
+        time.sleep(0.05)
+    path = "/" + seen.read_text().strip().removeprefix(server.root)
+    assert server.token not in path
+    assert server.ask("GET", path, headers={})[0] == 200
+    assert server.ask("GET", path, headers={})[0] == 403
+
+
+@pytest.mark.slow
 def test_no_path_leads_out_of_the_list(start, tmp_path) -> None:
     server = start()
     secret = tmp_path / "secret.txt"

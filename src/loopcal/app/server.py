@@ -87,7 +87,9 @@ class Handler(RequestHandler):
         if not is_known or self.request.headers.get("Origin", own) != own:
             raise DataError(report_finding("app.foreign"))
         given = self.get_query_argument("token", self.get_cookie(cookie, "") or "")
-        if not hmac.compare_digest(given.encode(), token.encode()):
+        if given in (once := self.settings["once"]):
+            once.clear()
+        elif not hmac.compare_digest(given.encode(), token.encode()):
             raise DataError(report_finding("app.denied"))
         self.set_cookie(cookie, token, httponly=True, samesite="Strict")
         UPLOAD_SIZE.check(int(self.request.headers.get("Content-Length", 0)), "file", "page")
@@ -175,11 +177,12 @@ class Handler(RequestHandler):
             project.version += 1
 
 
-async def serve(folder: Path, host: str, port: int, announce: Callable[[str], None]) -> None:
+async def serve(folder: Path, host: str, port: int, announce: Callable[[str, str], None]) -> None:
     """Serve the project of a folder until the process is asked to end; `announce` gets the address
-    to open.
+    to print, and one that opens once, as others may see the words with which a browser starts.
     """
-    project, token, ended = Project(folder), secrets.token_urlsafe(24), asyncio.Event()
+    project, ended = Project(folder), asyncio.Event()
+    token, once = secrets.token_urlsafe(24), secrets.token_urlsafe(24)
     try:
         sockets = bind_sockets(port, host)
     except (OSError, UnicodeError) as error:
@@ -187,6 +190,7 @@ async def serve(folder: Path, host: str, port: int, announce: Callable[[str], No
         raise DataError(report_finding("app.address", **facts)) from error
     port = sockets[0].getsockname()[1]
     facts = {"project": project, "token": token, "host": host.lower(), "ended": ended}
+    facts |= {"once": {once}}
     facts |= {"cookie": f"loopcal-{port}", "lock": asyncio.Lock(), "log_function": lambda _: None}
     server = HTTPServer(Application([(r"/(.*)", Handler)], **facts), max_body_size=10**15)
     server.add_sockets(sockets)
@@ -197,7 +201,8 @@ async def serve(folder: Path, host: str, port: int, announce: Callable[[str], No
     if host == "0.0.0.0":  # all addresses, of which a tablet needs one
         listed = (each.address for of in psutil.net_if_addrs().values() for each in of)
         shown = next((a for a in listed if re.fullmatch(r"(?!127\.)[\d.]+", a)), host)
-    announce(f"http://{shown}:{port}/?token={token}")
+    address = f"http://{shown}:{port}/?token="
+    announce(address + token, address + once)
     try:
         await ended.wait()
     finally:

@@ -49,12 +49,12 @@ def app(
     import_optional("tornado.web", "app")
     from loopcal.app.server import serve
 
-    def announce(address: str) -> None:
+    def announce(address: str, once: str) -> None:
         if host not in ("127.0.0.1", "::1", "localhost"):
             terminal.print_finding("app.open-network")
         terminal.print_message(f"loopcal: open {address} (Ctrl-C ends it)")
         if not no_browser:
-            open_page(address)
+            open_page(once)
 
     with TemporaryDirectory(prefix="loopcal-app-", ignore_cleanup_errors=True) as temporary:
         folder = keep or Path(temporary)
