@@ -93,10 +93,10 @@ def test_position_errors_are_those_of_each_target():
     assert errors["position"].targets == ("a", "a", "b", "b", "c", "c")
     assert errors["position"].rows.tolist() == [0, 1] * 3
     floor = compute_noise_floor([rows])
-    assert floor.position == pytest.approx(2 * UM * np.sqrt(3.0))
+    assert floor.rms["position"] == pytest.approx(2 * UM * np.sqrt(3.0))
     noise = np.random.default_rng(0).normal(size=(20000, 6, 3)) * 2 * UM
     largest = np.linalg.norm(noise, axis=2).max(axis=1)
-    assert floor.max["position"] == pytest.approx(np.median(largest), rel=0.01)
+    assert floor.metrics["max"]["position"] == pytest.approx(np.median(largest), rel=0.01)
 
 
 def test_one_entry_adds_a_metric_to_results_json_and_tables(validation, monkeypatch):

@@ -40,6 +40,7 @@ from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.transmission import SOURCE, find_fixed_rows, transmit_readings
+from loopcal.numerics.elimination import find_connected_groups
 from loopcal.numerics.statistics import compute_f_tail, find_distinct
 from loopcal.results.description import Field, fields
 from loopcal.results.result import Result
@@ -78,9 +79,7 @@ def find_correlated_groups(fit: Identification) -> tuple[CorrelatedGroup, ...]:
     rho = np.where(finite[:, None] & finite, fit.covariance, np.nan) * scale[:, None] * scale
     linked = np.where(np.isnan(rho), 0.0, np.abs(rho)) > STRONG
     np.fill_diagonal(linked, val=False)
-    group = np.arange(len(rho))
-    for i, j in np.argwhere(linked):
-        group[group == group[j]] = group[i]
+    group = find_connected_groups(np.argwhere(linked), len(rho))
     groups = []
     for number in find_distinct(group[linked.any(axis=1)]):
         places = np.flatnonzero(group == number)

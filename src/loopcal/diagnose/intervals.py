@@ -379,7 +379,7 @@ def compute_joint_region(
         raise EstimationError(report_finding("sampling.region-dependent", names=chosen.names))
     white = (vectors / np.sqrt(value)).T / chosen.sd
     degrees = float(chosen.posterior.count_degrees(white @ chosen.effect))
-    square = _find_square(q, degrees, level)
+    square = q * float(compute_f_quantile(q, degrees, 1.0 - level))
     return JointRegion(
         chosen.names, chosen.center, chosen.root @ chosen.root.T, level, degrees, square
     )
@@ -421,7 +421,7 @@ def compute_simultaneous_intervals(
         factor = np.full(q, float(np.quantile(np.concatenate(largest), level)))
     elif rule == "scheffe":
         rank = int((np.linalg.eigvalsh(chosen.correlation) > SMALLEST).sum())
-        factor = np.full(q, np.sqrt(_find_square(rank, least, level)))
+        factor = np.full(q, np.sqrt(rank * compute_f_quantile(rank, least, 1.0 - level)))
     else:
         tail = 1.0 - level
         single = 1.0 - (compute_single_level(tail, q) if rule == "sidak" else tail / q)
@@ -506,11 +506,6 @@ def _find_places(available: tuple[str, ...], names: str | Sequence[str]) -> IntA
             raise EstimationError(f"no free parameter has the name {name!r}{similar}")
         chosen += [i for i in matching if i not in chosen]
     return np.array(chosen, dtype=np.int64)
-
-
-def _find_square(count: int, degrees: float, level: float) -> float:
-    """Return the largest squared distance of `count` quantities within a region."""
-    return count * float(compute_f_quantile(count, degrees, 1.0 - level))
 
 
 @dataclass(frozen=True, eq=False)

@@ -37,7 +37,7 @@ from loopcal.mechanism.solutions import forward
 from loopcal.numerics.decomposition import decompose, empty_factor
 from loopcal.numerics.statistics import compute_any_probability, compute_chi_square_tail
 from loopcal.typing import BoolArray, FloatArray, IntArray
-from loopcal.units import Dimension, Unit, find_unit, list_symbols
+from loopcal.units import UNITS, Dimension, find_unit, list_symbols
 
 # Distance from its prediction, in medians, above which a point is not where its name says.
 FAR = 8.0
@@ -329,8 +329,10 @@ class FrameDrift:
     degrees: int
     p_value: float  # probability of a larger chi-square without motion
 
-    def report(self, shown: Unit) -> Finding:
-        """Return the finding of the motion, with angles in a unit."""
+    @property
+    def finding(self) -> Finding:
+        """The motion as a finding."""
+        arcsec = UNITS["arcsec"]
         return report_finding(
             "residuals.frame-moved",
             frame=self.frame,
@@ -339,8 +341,8 @@ class FrameDrift:
             rows=self.rows,
             shift=Quantity(1e3 * self.shift, "mm"),
             shift_sd=Quantity(1e3 * self.shift_sd, "mm"),
-            angle=Quantity(self.angle / shown.factor_to_si, shown.symbol),
-            angle_sd=Quantity(self.angle_sd / shown.factor_to_si, shown.symbol),
+            angle=Quantity(self.angle / arcsec.factor_to_si, arcsec.symbol),
+            angle_sd=Quantity(self.angle_sd / arcsec.factor_to_si, arcsec.symbol),
             p_value=self.p_value,
             tiny=self.p_value < TINY,
         )
@@ -377,16 +379,14 @@ class _Repeats(NamedTuple):
     session: list[str]
 
 
-def report_base_targets(data: Measurements, angle: str = "arcsec") -> tuple[Finding, ...]:
-    """Return findings on frames that moved within a session, and on targets that moved; `angle` is
-    the symbol of the unit of angles.
-    """
+def report_base_targets(data: Measurements) -> tuple[Finding, ...]:
+    """Return findings on frames that moved within a session, and on targets that moved."""
     shapes = compare_shapes(data)
     changed = [s for s in shapes if compute_any_probability(s.p_value, len(shapes)) < LEVEL]
     drifts = estimate_frame_drifts(_leave_out(data, changed))
     moved = [d for d in drifts if compute_any_probability(d.p_value, len(drifts)) < LEVEL]
     findings = [shape.finding for shape in changed]
-    findings += [drift.report(find_unit(angle)) for drift in moved]
+    findings += [drift.finding for drift in moved]
     used = {name for rows in data.observations for name in rows.session.tolist()}
     open_frames = [rows for rows in data.base_observations if "frame" in rows.kind.unknown]
     on_base = dict.fromkeys(name for rows in open_frames for name in rows.session.tolist())

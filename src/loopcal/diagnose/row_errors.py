@@ -223,21 +223,6 @@ class NoiseFloor:
         """Root mean square of the errors of each quantity [m] or [rad]."""
         return self.metrics["rms"]
 
-    @property
-    def max(self) -> Mapping[str, float]:
-        """Median of the largest error of each quantity [m] or [rad]."""
-        return self.metrics["max"]
-
-    @property
-    def position(self) -> float:
-        """Root mean square of the position error [m]; NaN where no row measures it."""
-        return self.rms.get("position", float("nan"))
-
-    @property
-    def orientation(self) -> float:
-        """Root mean square of the orientation error [rad]; NaN where no row measures it."""
-        return self.rms.get("orientation", float("nan"))
-
 
 @dataclass(frozen=True)
 class KindErrors:

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 from loopcal import engine
 from loopcal.errors import EstimationError
 from loopcal.findings import report_finding
-from loopcal.numerics.decomposition import RANK_TOLERANCE, are_nonzero
+from loopcal.numerics.decomposition import are_nonzero
 from loopcal.numerics.elimination import eliminate_from_triangle
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
@@ -108,13 +108,11 @@ class ObservableSpace:
         )
 
 
-def find_observable_space(
-    rows: FloatArray, prior: PriorInformation, tolerance: float = RANK_TOLERANCE
-) -> ObservableSpace:
+def find_observable_space(rows: FloatArray, prior: PriorInformation) -> ObservableSpace:
     """Return the directions that all allowed groups (N, r, o + p) and the prior determine together.
 
-    The remainder of the machine's columns, without the nuisance parameters, is cut at `tolerance`
-    times its largest singular value.
+    The remainder of the machine's columns, without the nuisance parameters, is cut at the rank
+    tolerance times its largest singular value.
     """
     allowed = rows[is_allowed(rows)].reshape(-1, rows.shape[-1])
     o = prior.n_nuisance
@@ -126,7 +124,7 @@ def find_observable_space(
         done = eliminate_from_triangle(R[:o, :o], R[:o, o:], R[o:, o:], length)
         nuisance, rest = done.directions[done.is_observable].T / length[:, None], done.rest
     _, s, vt = np.linalg.svd(rest)
-    observable = vt[: len(s)][are_nonzero(s, tolerance)]
+    observable = vt[: len(s)][are_nonzero(s)]
     return ObservableSpace(observable.T, nuisance, s)
 
 

@@ -908,6 +908,5 @@ def select_measured(data: Measurements) -> IntArray:
     """Return the measured poses, and others spread over the data up to `FEWEST_POSES`."""
     measured = np.unique(np.concatenate([o.rows.ravel() for o in data.observations] or [[]]))
     others = np.setdiff1d(np.arange(data.n_poses), measured)
-    missing = max(FEWEST_POSES - len(measured), 0) if len(others) else 0
-    spread = np.linspace(0, len(others) - 1, missing)
-    return np.union1d(measured, others[np.unique(spread.astype(np.intp))]).astype(np.intp)
+    more = choose_evenly(len(others), max(FEWEST_POSES - len(measured), 0))
+    return np.union1d(measured, others[more]).astype(np.intp)

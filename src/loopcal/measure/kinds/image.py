@@ -451,10 +451,6 @@ class Image(Kind):
         """Return the corners (r, 1): all of them, again and again."""
         return (np.arange(r) % self.rows_per_pose)[:, None].astype(float)
 
-    def name_label(self, columns: FloatArray) -> str:
-        """Return the corner of a row (c,) in words."""
-        return f"corner {columns[0]:.0f}"
-
     def detect_present(self, measured: FloatArray) -> BoolArray:
         """Return which pixels exist."""
         return ~np.isnan(measured[..., 1:] + measured[..., :1])

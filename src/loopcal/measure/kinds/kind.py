@@ -274,11 +274,6 @@ class Kind(ABC):
         """Return the labels (r, `label_count`) of the rows of a simulation."""
         return np.zeros((r, 0))
 
-    def name_label(self, columns: FloatArray) -> str:
-        """Return what a row (c,) measures, such as a corner; empty where all rows are alike."""
-        del columns
-        return ""
-
     def hide_unseen(self, T: FloatArray, columns: FloatArray, values: FloatArray) -> FloatArray:
         """Return measured columns (t, r, c) with NaN where an instrument sees nothing."""
         del T, values

@@ -648,13 +648,11 @@ def list_statistics(study: Study, frame: str) -> list[str]:
     return [name_measure(what, frame, s) for what in study.parts for s in STATISTICS[1:]]
 
 
-def list_methods(
-    cell: Cell, measures: Sequence[str], methods: Sequence[str] = (BEFORE, *METHODS)
-) -> Iterator[tuple[Any, ...]]:
+def list_methods(cell: Cell, measures: Sequence[str]) -> Iterator[tuple[Any, ...]]:
     """Yield method, number of machines and medians; machines on which a method did not converge
     have a row of their own.
     """
-    for method in methods:
+    for method in (BEFORE, *METHODS):
         for is_lost in (False, True):
             count = int((cell.converged[method] != is_lost).sum())
             medians = (cell.compute_median(method, measure, is_lost) for measure in measures)
