@@ -309,6 +309,15 @@ def test_rows_without_names_belong_to_the_suggested_poses(measure, rows) -> None
     assert read_used() == [first]
 
 
+def test_links_stand_for_the_folder_of_a_session(measure, rows) -> None:
+    Path("session").symlink_to("there")
+    measure([join(rows[0])])
+    assert Path("session").is_symlink()
+    assert len(read_csv(Path("there/measurements.csv"))) == 1
+    Path("circle").symlink_to("circle")
+    measure([], "this symbolic link has no target", words="measure plan -o circle", code=1)
+
+
 @pytest.mark.slow
 def test_two_commands_do_not_measure_into_one_folder(rows) -> None:
     with subprocess.Popen(COMMAND, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as first:

@@ -29,7 +29,14 @@ from loopcal.io.core.csv_table import (
     parse_finite,
     read_template,
 )
-from loopcal.io.core.text_file import lock, report_write_errors, sha256, sync_folder, write_text
+from loopcal.io.core.text_file import (
+    lock,
+    report_write_errors,
+    resolve_links,
+    sha256,
+    sync_folder,
+    write_text,
+)
 from loopcal.io.data.columns import TIME
 from loopcal.io.exports.conversion import Row, format_rows, read_rows
 from loopcal.measure.measurements import Measurements
@@ -115,11 +122,11 @@ def open_session(folder: Path, sheet: Table, columns: Sequence[str]) -> Iterator
     FileError : the folder cannot be written, is used by another command, has other content, or
     belongs to another sheet.
     """
-    path, digest = folder / ROWS, sha256(sheet.path)
+    path, digest = resolve_links(folder) / ROWS, sha256(sheet.path)
     if folder.exists() and not path.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise FileError(report_finding("session.other-content"), folder)
     with report_write_errors(path):
-        folder.mkdir(parents=True, exist_ok=True)
+        path.parent.mkdir(parents=True, exist_ok=True)
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o666)
     try:
         if lock(descriptor) is False:
@@ -131,7 +138,7 @@ def open_session(folder: Path, sheet: Table, columns: Sequence[str]) -> Iterator
         if begin.startswith(content):  # nothing yet, or a header that was not written to its end
             os.ftruncate(descriptor, 0)
             write_line(descriptor, path, "\n".join(lines))
-            sync_folder(folder)
+            sync_folder(path.parent)
         elif not content.startswith(REMARK.encode()):
             raise FileError(report_finding("session.other-content"), folder)
         elif not content.startswith(begin):
