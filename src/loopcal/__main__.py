@@ -2,10 +2,11 @@
 """`loopcal` and `python -m loopcal`: the command line.
 
 Ctrl-C is answered in a sentence from the first import on; the command line itself answers it once
-it runs.
+it runs. The end that the system asks for, as `kill` and `timeout` do, is answered in the same way.
 """
 
 import gc
+import signal
 import sys
 
 COLLECTED_AFTER = 300_000
@@ -18,6 +19,10 @@ than 200,000 objects.
 def run() -> int:
     """Run the command line and return its exit code."""
     gc.set_threshold(COLLECTED_AFTER)
+    for name in ("SIGTERM", "SIGHUP"):  # the latter is ignored below nohup
+        number = getattr(signal, name, None)
+        if number is not None and signal.getsignal(number) is signal.SIG_DFL:
+            signal.signal(number, signal.default_int_handler)
     try:
         from loopcal.cli.entry_point import main
 

@@ -1,7 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Ctrl-C that arrives in a callback of a library still stops a command, in one sentence."""
+"""Ctrl-C that arrives in a callback of a library still stops a command, in one sentence, and so
+does the end that the system asks for.
+"""
 
 import signal
+import subprocess
 import sys
 import time
 
@@ -47,3 +50,21 @@ def test_lost_exceptions_of_other_kinds_are_reported(monkeypatch) -> None:
     with pytest.raises(KeyboardInterrupt), repeat_lost_interrupts():
         _lose_interrupt()
     assert reported == [ValueError]
+
+
+STOPPED = """
+import signal, sys
+from loopcal.__main__ import run
+from loopcal.cli import entry_point
+entry_point.command_line.main = lambda *_, **__: signal.raise_signal(signal.{name})
+sys.argv[1:] = ["check", "five-bar"]
+sys.exit(run())
+"""
+
+
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP", "SIGINT"])
+def test_an_end_that_the_system_asks_for_is_answered_as_ctrl_c(name) -> None:
+    words = [sys.executable, "-c", STOPPED.format(name=name)]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert done.stderr == "loopcal: stopped before the end, and loopcal wrote no result.\n"
+    assert done.returncode == 1
