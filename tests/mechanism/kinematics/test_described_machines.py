@@ -287,3 +287,44 @@ def test_gaps_of_redundant_motors_are_lengths(tmp_path: Path) -> None:
     assert all(end.converged.all() for end in ends)
     assert_allclose(ends[1].residual, 25.4 * ends[0].residual, rtol=1e-9)
     assert ends[0].residual[0] < 4 * 0.2 * np.deg2rad(0.24) * 3  # [m], cranks of 0.2 m
+
+
+# A delta whose arms are bodies: the platform does not turn, the arms do.
+ARMS = """
+format: 1
+family: limbs
+name: arms
+units: {length: mm, angle: deg}
+freedoms: [x, y, z]
+controlled: [x, y, z]
+bodies: [{name: arm, copies: {count: 3}}]
+limbs:
+  - name: shoulder
+    to: arm
+    ending: rigid
+    copies: {count: 3}
+    chain: [{joint: R, name: motor, at: [200, 0, 0], axis: y, actuated: q, start: 20}]
+  - name: rod
+    on: arm
+    tip: [300, 0, 0]
+    attach: [60, 0, 0]
+    ending: distance
+    length: 800
+    copies: {count: 3}
+drives: {q: {reads: angle, stroke: [-60, 90], unknown: [offset], angle: {sd: 0.1}}}
+home: {z: -750}
+workspace: {x: [-150, 150], y: [-150, 150], z: [-800, -700]}
+"""
+
+
+def test_arms_of_a_delta_turn_although_its_platform_does_not(tmp_path: Path) -> None:
+    robot = load(ARMS, tmp_path)
+    q = sample_workspace(robot, POSES, 3).solution.q
+    T = forward(robot, q).T
+    assert_allclose(T[:, :3, :3], np.tile(np.eye(3), (POSES, 1, 1)), rtol=0, atol=1e-15)
+    for i, angle in enumerate(2 * np.pi / 3 * np.arange(3)):
+        radius = 0.2 + 0.3 * np.cos(q[:, i]) - 0.06
+        axis = np.array([np.cos(angle), np.sin(angle), 0.0])
+        elbow = radius[:, None] * axis - np.stack([0 * q[:, i]] * 2 + [0.3 * np.sin(q[:, i])], 1)
+        rods = np.linalg.norm(T[:, :3, 3] - elbow, axis=1)
+        assert_allclose(rods, 0.8, rtol=0, atol=ATOL)
