@@ -17,6 +17,7 @@ import pytest
 
 from loopcal.cli.entry_point import main
 from loopcal.documents import find_browser, is_root
+from loopcal.findings import report_finding
 from tests.app.conftest import Server
 
 BROWSER = find_browser()
@@ -273,7 +274,7 @@ def test_a_lost_connection_is_said_and_typed_values_stay(visit, start, tmp_path)
 def test_the_page_without_its_token_says_what_to_open(server, browser) -> None:
     tab = browser.new_page()
     tab.goto(server.root)
-    assert "Open the address that loopcal app printed" in tab.inner_text("body")
+    assert tab.inner_text("body") == str(report_finding("app.denied"))
     tab.goto(server.address)
     tab.wait_for_selector("#robot option:nth-child(9)", state="attached")
     assert tab.url == server.root  # the token is in no history and in no picture of the screen
@@ -313,6 +314,7 @@ def test_the_companion_leads_to_a_calibration(visit, start, tmp_path) -> None:
             tab.keyboard.press("Tab" if value is not values[-1] else "Enter")
         count += 1
         tab.wait_for_selector(f"#visits tbody tr:nth-child({count})")
+        tab.wait_for_selector("#row:not([aria-busy=true])", state="attached")
         if count == wrong + 1:
             tab.wait_for_selector("#said.doubt")
             assert "does not fit" in tab.inner_text("#said")

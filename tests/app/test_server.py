@@ -16,10 +16,18 @@ import pytest
 
 from loopcal.app.project import Project, clean_name, recognize
 from loopcal.cli.entry_point import main
+from loopcal.errors import DataError
+from loopcal.findings import report_finding
 from tests.app.conftest import EXAMPLE
 from tests.io.test_probe_reports import MARLIN, REPRAP
 
 DATA = (EXAMPLE / "measurements.csv").read_bytes()
+
+
+def word(code: str) -> str:
+    """Return the sentence of a finding without data."""
+    return str(report_finding(code))
+
 
 NAMES = {
     "printer.cfg": "printer.cfg",
@@ -51,8 +59,9 @@ def test_a_name_of_a_client_becomes_a_name_inside_the_folder(name: str, tmp_path
 
 @pytest.mark.parametrize("name", ["", "..", "///", "...", "- -"])
 def test_a_name_of_nothing_is_refused(name: str) -> None:
-    with pytest.raises(Exception, match="needs a name"):
+    with pytest.raises(DataError) as caught:
         clean_name(name)
+    assert caught.value.code == "app.unnamed"
 
 
 KINDS = {
@@ -136,7 +145,7 @@ def test_only_the_page_with_the_token_is_answered(start) -> None:
     assert (status, page[:15]) == (200, b"<!doctype html>")
     assert {"HttpOnly", "SameSite=Strict"} <= set(headers["set-cookie"].split("; "))
     assert server.ask("GET", "/?token=wrong", headers={})[0] == 403
-    assert server.ask("GET", "/", headers={})[2].startswith(b"this address needs its token.")
+    assert server.ask("GET", "/", headers={})[2].decode() == word("app.denied")
     assert server.end() == (0, "")
 
 
@@ -239,8 +248,8 @@ def test_an_end_during_work_leaves_no_folder_and_no_process(start, name: str) ->
 def test_work_is_stopped_and_another_waits(start) -> None:
     server = start()
     begin_work(server)
-    assert "Wait for its end" in server.tell("/calibrate")
-    assert "Wait for its end" in server.tell("/more.csv", b"pose\n", "PUT")
+    assert server.tell("/calibrate") == word("app.busy")
+    assert server.tell("/more.csv", b"pose\n", "PUT") == word("app.busy")
     children = server.list_children()
     assert server.tell("/stop") == ""
     state = server.wait()
@@ -272,7 +281,8 @@ def test_an_address_that_is_not_ours_is_refused(words: str, monkeypatch, capsys)
     if "--port" in words:  # root may
         monkeypatch.setattr("loopcal.app.server.bind_sockets", refuse)
     assert main(["app", "--no-browser", *words.split()]) == 1
-    assert "does not let loopcal listen on" in capsys.readouterr().err
+    host, port = (words.split()[1], 0) if "--host" in words else ("127.0.0.1", 1)
+    assert f"{host}, port {port}" in capsys.readouterr().err
 
 
 def test_a_folder_with_other_content_is_refused_and_kept(tmp_path, capsys) -> None:
@@ -280,7 +290,7 @@ def test_a_folder_with_other_content_is_refused_and_kept(tmp_path, capsys) -> No
     file.parent.mkdir()
     file.write_text("mine")
     assert main(["app", "--no-browser", "--keep", str(tmp_path)]) == 1
-    assert "other content" in capsys.readouterr().err
+    assert word("session.other-content") in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["result"]
     assert file.read_text() == "mine"
 
@@ -302,7 +312,7 @@ def test_names_of_all_languages_are_kept(start) -> None:
 def test_an_open_network_is_warned_of(start) -> None:
     server = start("--host", "0.0.0.0")
     assert server.ask("GET", "/", None, {"Host": f"evil.example:{server.port}"})[0] == 403
-    assert "everyone in the network" in server.notes
+    assert word("app.open-network") in server.notes
     server.host = server.root.split("/")[2].rpartition(":")[0]
     listed = [each.address for of in psutil.net_if_addrs().values() for each in of]
     assert server.host in listed or not any(a.count(".") == 3 and a[:4] != "127." for a in listed)

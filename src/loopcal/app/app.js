@@ -272,11 +272,11 @@ $("sorted").onchange = drawRows;
 $("plan").onsubmit = (event) => { event.preventDefault(); ask("plan", Object.fromEntries(new FormData(event.target))); };
 $("row").onsubmit = async (event) => {
   event.preventDefault();
-  if ($("row").inert) return; // the values of this pose are on their way
+  if ($("row").ariaBusy === "true") return; // the values of this pose are on their way
   const values = [...$("row").querySelectorAll("input")].map((field) => field.value.trim().replace(",", "."));
-  $("row").inert = true;
+  $("row").ariaBusy = "true";
   await ask("tell", { pose: state.session.pose, values });
-  $("row").inert = false;
+  $("row").ariaBusy = "false";
   $("row").querySelector("input")?.focus();
 };
 if (location.search.includes("token")) history.replaceState(null, "", location.pathname);

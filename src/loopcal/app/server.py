@@ -134,7 +134,8 @@ class Handler(RequestHandler):
         sent = -1
         with suppress(StreamClosedError):
             for tick in takewhile(lambda _: not self.settings["ended"].is_set(), count()):
-                if self.project.version != sent or tick % HEARTBEAT == 0:
+                is_due = self.project.version != sent or tick % HEARTBEAT == 0
+                if is_due and not self.settings["lock"].locked():  # not amid an action
                     sent, shown = self.project.version, self.project.describe()
                     self.write(f"data: {json.dumps(shown)}\n\n")
                     await self.flush()
