@@ -248,7 +248,7 @@ def test_reproduce_writes_the_document_that_it_prints(capsys, tmp_path, monkeypa
     written = json.loads((folder / "result.json").read_text("utf-8"))
     assert written["made_by"]["seeds"] == {"seed": 0}
     assert "figures/curve.png" in written.pop("files")
-    assert written == document
+    assert {"format": 1, **written} == document
     assert (folder / "figures" / "curve.png").is_file()
 
 
