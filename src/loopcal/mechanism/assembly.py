@@ -294,8 +294,7 @@ class Assembly:
                     turns = along if joint.kind == "R" else np.zeros(3, bool)
                     across = (turns.any() & ~turns | (turns.sum() > 1)) & moves[3:].any()
                     moves |= np.concatenate([turns, across | (along & ~turns)])
-        if moves[:3].sum() == 2:
-            moves[:] = True
+        moves |= moves[:3].sum() == 2
         return tuple(axis for axis, moved in zip(AXES, moves, strict=True) if moved)
 
     def select_rows(self, limb: Limb) -> tuple[int, ...]:
