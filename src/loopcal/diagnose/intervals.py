@@ -54,12 +54,10 @@ LARGEST_TAIL = 0.2  # share of the draws whose weights are the tail, at most; se
 
 def normalize_weights(log_weight: FloatArray) -> FloatArray:
     """Return weights (T,) of sum 1 from their logarithms; zero where these are not finite."""
+    from scipy.special import softmax
+
     finite = np.isfinite(log_weight)
-    if not finite.any():
-        return np.zeros(len(log_weight))
-    shifted = np.where(finite, log_weight - log_weight[finite].max(), -np.inf)
-    weight = np.exp(shifted)
-    return np.asarray(weight / weight.sum())
+    return softmax(np.where(finite, log_weight, -np.inf)) if finite.any() else np.zeros(len(finite))
 
 
 def effective_size(weight: FloatArray) -> float:

@@ -18,7 +18,6 @@ import numpy as np
 
 from loopcal import geometry
 from loopcal.findings import Finding, report_finding
-from loopcal.geometry import OrientationForm, parse_orientation
 from loopcal.measure.kinds.kind import Kind
 from loopcal.measure.kinds.poses import Component, Pose
 from loopcal.measure.kinds.position import Bearing
@@ -217,7 +216,7 @@ def _list_rotations(kind: Kind) -> Iterator[Slip]:
         eulers = [f"euler-{order}" for order in geometry.EULER_ORDERS]
         for name in ("rotation-vector", "tilt-torsion", *eulers):
             if name != form.name:
-                other = parse_orientation(name)
+                other = geometry.parse_orientation(name)
                 read = rewrite(lambda v, other=other: other.to_matrix(v[:, angles]))
                 yield "orientation-form", {"form": name}, read
     yield "inverted-rotations", {}, rewrite(back)
@@ -278,7 +277,9 @@ def _columns_by_name(kind: Kind) -> dict[str, list[int]]:
     return named
 
 
-def _orientation_columns(kind: Kind) -> tuple[OrientationForm, list[int], list[int]] | None:
+def _orientation_columns(
+    kind: Kind,
+) -> tuple[geometry.OrientationForm, list[int], list[int]] | None:
     """Return form and columns of a whole orientation, and the columns of the position if there are
     any; None for a kind without orientation.
     """

@@ -12,7 +12,6 @@ from typing import ClassVar, Self
 import numpy as np
 
 from loopcal import geometry
-from loopcal.geometry import solve_directions
 from loopcal.measure.array_checks import check_direction, check_pose
 from loopcal.measure.kinds import setup_parameters as setup
 from loopcal.measure.kinds.kind import (
@@ -27,7 +26,6 @@ from loopcal.measure.kinds.kind import (
     make_angles,
 )
 from loopcal.measure.kinds.position import convert_camera_angles, predict_camera_angles
-from loopcal.measure.kinds.setup_parameters import make_perpendicular_basis
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import Dimension
 
@@ -119,7 +117,7 @@ class DirectionKind(Kind):
         for d in self.convert_to_directions(measured[complete]):
             if of_orientation in self.unknown:
                 known = None if of_direction in self.unknown else a
-                rotations, directions = solve_directions(d, Q, known)
+                rotations, directions = geometry.solve_directions(d, Q, known)
             else:
                 mean = np.einsum("rji,jk,rk->i", Q, S, d)
                 rotations, directions = S[None], (mean / np.linalg.norm(mean))[None]
@@ -223,7 +221,7 @@ class Direction(AxisKind):
         # a row with a missing component has no direction: its length is not 1
         complete = length > 0.5
         m = np.where(complete, measured / np.where(complete, length, 1.0), self.placeholder)
-        Bt = np.swapaxes(make_perpendicular_basis(m), -1, -2)
+        Bt = np.swapaxes(setup.make_perpendicular_basis(m), -1, -2)
         facing = 1.0 + np.sum(m * d, axis=-1, keepdims=True)
         scale = 2.0 / np.where(facing > 1e-9, facing, 1e-9)
         residual = scale * (Bt @ d[..., None])[..., 0]
@@ -235,7 +233,7 @@ class Direction(AxisKind):
     ) -> FloatArray:
         """Return directions (t, r, 3), rotated by the noise (t, r, 2) perpendicular to them."""
         d, _ = self.locate_direction(T, values)
-        rotation = np.cross(d, (make_perpendicular_basis(d) @ noise[..., None])[..., 0])
+        rotation = np.cross(d, (setup.make_perpendicular_basis(d) @ noise[..., None])[..., 0])
         return (geometry.exp_so3(rotation) @ d[..., None])[..., 0]
 
 

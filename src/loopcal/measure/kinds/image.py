@@ -25,7 +25,6 @@ import numpy as np
 
 from loopcal import geometry
 from loopcal.errors import DataError
-from loopcal.geometry import align_point_sets, solve_frame_and_points, solve_hand_eye
 from loopcal.measure.array_checks import check_pose, set_fields
 from loopcal.measure.kinds import setup_parameters as setup
 from loopcal.measure.kinds.kind import Column, Evaluation, InvalidRows, Kind, checked, list_rows
@@ -663,12 +662,12 @@ class Image(Kind):
             moving = (T[:, None, :3, None, :3] * np.eye(4)[:, None, :, None]).reshape(-1, 3, 12)
             origin = np.repeat(T[:, :3, 3], 4, axis=0)
             sets = (seen.reshape(-1, 3)[None], moving[None], origin[None])
-            frames, places = solve_frame_and_points(*sets)[0]
-            tools = [align_point_sets(q, of.reshape(4, 3)) for of in places]
+            frames, places = geometry.solve_frame_and_points(*sets)[0]
+            tools = [geometry.align_point_sets(q, of.reshape(4, 3)) for of in places]
             pairs += list(zip(frames, tools, strict=True))
         for frame, tool in ((None, stated[carried]), (stated[fixed], None)):
             if (frame is None and not known[0]) or (tool is None and not known[1]):
-                pairs.append(solve_hand_eye(T, measured, frame, tool))
+                pairs.append(geometry.solve_hand_eye(T, measured, frame, tool))
         return [
             {
                 name: setup.encode_frame(stated[name], of)

@@ -12,7 +12,6 @@ import numpy as np
 
 from loopcal import engine, geometry
 from loopcal.errors import DataError
-from loopcal.geometry import OrientationForm, align_point_sets, solve_hand_eye
 from loopcal.measure.array_checks import check_names, check_pose, set_fields
 from loopcal.measure.kinds import setup_parameters as setup
 from loopcal.measure.kinds.kind import (
@@ -171,7 +170,7 @@ class Pose(ToolKind):
         geometry.parse_orientation(self.orientation)  # refuses an unknown form
 
     @cached_property
-    def form(self) -> OrientationForm:
+    def form(self) -> geometry.OrientationForm:
         """The form of the orientation as an object."""
         return geometry.parse_orientation(self.orientation)
 
@@ -262,7 +261,7 @@ class Pose(ToolKind):
         if not self.unknown or np.count_nonzero(complete) < 3:
             return super().guess_values(T, measured)
         columns = measured[complete]
-        frame, tool = solve_hand_eye(
+        frame, tool = geometry.solve_hand_eye(
             T[complete],
             geometry.make_pose(self.form.to_matrix(columns[:, :-3]), columns[:, -3:]),
             None if "frame" in self.unknown else self.T_base_frame,
@@ -374,7 +373,7 @@ class Component(ToolKind):
             )
 
     @cached_property
-    def form(self) -> OrientationForm | None:
+    def form(self) -> geometry.OrientationForm | None:
         """The form of the orientation, None where no angle is declared."""
         return None if self.orientation is None else geometry.parse_orientation(self.orientation)
 
@@ -485,7 +484,7 @@ class Component(ToolKind):
             return super().guess_values(T, measured)
         points = (T @ self.stated_tool)[complete, :3, 3]
         positions = measured[complete][:, [self.components.index(name) for name in POSITION_AXES]]
-        frame = align_point_sets(positions, points)
+        frame = geometry.align_point_sets(positions, points)
         return setup.encode_frame(self.T_base_frame, frame)[None]
 
     @property

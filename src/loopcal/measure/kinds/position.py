@@ -17,13 +17,6 @@ import numpy as np
 
 from loopcal import geometry
 from loopcal.errors import DataError
-from loopcal.geometry import (
-    FLATNESS,
-    align_point_sets,
-    solve_frame_and_points,
-    solve_least_squares,
-    solve_resection,
-)
 from loopcal.measure.array_checks import check_array, check_names, check_pose, set_fields
 from loopcal.measure.kinds import setup_parameters as setup
 from loopcal.measure.kinds.kind import (
@@ -277,7 +270,7 @@ class Position(TargetKind):
             )
         station = np.zeros(3) if self.station is None else self.station
         lever = np.nan_to_num(measured).reshape(*measured.shape[:-1], -1, 3) - station
-        length = np.maximum(np.linalg.norm(lever, axis=-1), FLATNESS)[..., None]
+        length = np.maximum(np.linalg.norm(lever, axis=-1), geometry.FLATNESS)[..., None]
         along = (lever / length)[..., None] * (lever / length)[..., None, :]
         spread = {"range": along, "angle": length[..., None] ** 2 * (np.eye(3) - along)}
         spread["centering"] = np.broadcast_to(np.eye(3), along.shape)
@@ -300,7 +293,7 @@ class Position(TargetKind):
             _, _, points, positions = self.collect_points(base, measured)
             if not self.locates_frame or len(positions) < 3:
                 return self.nominal_values[None]
-            frame = align_point_sets(positions, points)
+            frame = geometry.align_point_sets(positions, points)
             return self.assemble_values({"frame": setup.encode_frame(self.T_base_frame, frame)})
         if {"frame", "targets"} <= set(self.unknown):
             guess = self.guess_sets(T[None], measured[None], np.ones((1, len(T)), dtype=bool))[0]
@@ -315,9 +308,11 @@ class Position(TargetKind):
         if "frame" in self.unknown and len(positions) > 2 and _are_collinear(positions):
             raise self._report_line(len(positions))
         if "targets" not in self.unknown:
-            return setup.encode_frame(self.T_base_frame, align_point_sets(positions, points))[None]
+            frame = geometry.align_point_sets(positions, points)
+            return setup.encode_frame(self.T_base_frame, frame)[None]
         base = positions @ self.T_base_frame[:3, :3].T + self.T_base_frame[:3, 3]
-        return solve_least_squares(moving.reshape(base.size, -1), (base - origin).ravel())[None]
+        rows = moving.reshape(base.size, -1)
+        return geometry.solve_least_squares(rows, (base - origin).ravel())[None]
 
     def guess_sets(
         self, T: FloatArray, measured: FloatArray, is_row: BoolArray
@@ -340,7 +335,7 @@ class Position(TargetKind):
             moving = own[:, :, None, :3, None, :3] * np.eye(k)[:, None, :, None]
             moving = moving.reshape(len(chosen), r * k, 3, 3 * k)
             origin = np.repeat(own[:, :, :3, 3], k, axis=1)
-            solved = solve_frame_and_points(positions[chosen], moving, origin)
+            solved = geometry.solve_frame_and_points(positions[chosen], moving, origin)
             frames, places = (np.concatenate(part) for part in zip(*solved, strict=True))
             items = {"frame": setup.encode_frame(self.T_base_frame, frames), "targets": places}
             ends = np.cumsum([len(of_set) for of_set, _ in solved])[:-1]
@@ -372,7 +367,7 @@ def _are_collinear(points: FloatArray) -> BoolArray:
     present, count = np.where(is_there, points, 0.0), is_there.sum(axis=-2, keepdims=True)
     middle = present.sum(axis=-2, keepdims=True) / np.maximum(count, 1)
     extent = np.linalg.svd(np.where(is_there, points - middle, 0.0), compute_uv=False)
-    return np.asarray(extent[..., 1] <= FLATNESS * extent[..., 0])
+    return np.asarray(extent[..., 1] <= geometry.FLATNESS * extent[..., 0])
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
@@ -450,7 +445,7 @@ class Bearing(TargetKind):
             rays = np.stack(
                 [level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], axis=-1
             )
-        frames = solve_resection(rays, points)
+        frames = geometry.solve_resection(rays, points)
         return self.assemble_values({"frame": setup.encode_frame(self.T_base_frame, frames)})
 
 

@@ -16,7 +16,6 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from loopcal import geometry
-from loopcal.geometry import stack_blocks
 from loopcal.parameters import Parameter
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension
@@ -109,7 +108,7 @@ def linearize_frame(values: FloatArray) -> FloatArray:
 
 def stack_diagonally(first: FloatArray, second: FloatArray) -> FloatArray:
     """Return matrices (.., 6, 6) with two blocks (.., 3, 3), which broadcast, on their diagonal."""
-    return stack_blocks(((first, None), (None, second)))
+    return geometry.stack_blocks(((first, None), (None, second)))
 
 
 def make_perpendicular_basis(direction: FloatArray) -> FloatArray:

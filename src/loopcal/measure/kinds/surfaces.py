@@ -17,7 +17,6 @@ import numpy as np
 
 from loopcal import geometry
 from loopcal.errors import DataError
-from loopcal.geometry import solve_least_squares, solve_trilateration
 from loopcal.measure.array_checks import check_direction, check_point
 from loopcal.measure.kinds import setup_parameters as setup
 from loopcal.measure.kinds.directions import UPWARD
@@ -135,7 +134,7 @@ class Plane(SurfaceKind):
         """Return the planes of least scatter, and the one that unequal gaps determine."""
         middle = x.mean(axis=0)
         normals = [np.linalg.svd(x - middle, full_matrices=False)[2][2]]
-        gradient = solve_least_squares(x - middle, gaps[:, 0] - gaps.mean())
+        gradient = geometry.solve_least_squares(x - middle, gaps[:, 0] - gaps.mean())
         if np.linalg.norm(gradient) > 0.1:
             normals.append(gradient / np.linalg.norm(gradient))
         n = np.array([normal if normal @ self.along >= 0.0 else -normal for normal in normals])
@@ -254,5 +253,5 @@ class Sphere(SurfaceKind):
         """Return center and radius by trilateration: a distance from the center is a gap plus the
         radius, which is a common offset.
         """
-        centers, offsets = solve_trilateration(x, gaps[:, 0], with_offset=True)
+        centers, offsets = geometry.solve_trilateration(x, gaps[:, 0], with_offset=True)
         return np.concatenate([centers, -offsets[:, None]], axis=-1)

@@ -36,6 +36,7 @@ from loopcal.io.formats.linkages.tree import (
     make_end,
     measure_rounding,
     parse_xml,
+    require_links,
 )
 from loopcal.typing import FloatArray
 
@@ -193,10 +194,8 @@ def list_embedded_constraints(tree: LinkTree, parts: Sequence[Element]) -> LinkT
     for element in (joint for part in parts for joint in part.find_all("joint")):
         frames = Frames({element.attributes.get("name", ""): element}, drawn)
         joint = _read_joint(element, frames, _parse_pose(element), in_model=False)
-        for link in (joint.parent, joint.child):
-            if link not in drawn:
-                sentence = f"joint {joint.name!r} names the link {link!r}, which does not exist"
-                raise element.error(f"{sentence}{suggest_names(link, drawn)}. Correct it")
+        ends = (joint.parent, joint.child)
+        require_links(drawn, f"joint {joint.name!r}", ends, element.error)
         if joint.name in tree.joints or joint.kind == GEARBOX:
             raise element.error(report_finding("files.urdf-other-loop", element=joint.name))
         found.append(joint.close(drawn))
@@ -230,10 +229,8 @@ def read_tree(path: Path) -> LinkTree:
     if any(WORLD in (joint.parent, joint.child) for joint in joints):
         drawn = {WORLD: np.eye(4), **drawn}
     for joint in joints:
-        for link in (joint.parent, joint.child):
-            if link not in drawn:
-                sentence = f"joint {joint.name!r} names the link {link!r}, which does not exist"
-                raise joint.element.error(f"{sentence}{suggest_names(link, drawn)}. Correct it")
+        ends = (joint.parent, joint.child)
+        require_links(drawn, f"joint {joint.name!r}", ends, joint.element.error)
     geared = [joint for joint in joints if joint.kind == GEARBOX]
     joints = [joint for joint in joints if joint.kind != GEARBOX]
     children = {joint.child for joint in joints}

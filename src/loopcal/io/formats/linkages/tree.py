@@ -12,7 +12,7 @@ import math
 import re
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 from xml.parsers import expat
@@ -296,6 +296,16 @@ class LinkTree:
         return replace(tree, constraints=constraints)
 
 
+def require_links(
+    known: Collection[str], what: str, links: Iterable[str], error: Callable[[str], FileError]
+) -> None:
+    """Refuse a joint or constraint that names a link which is not among the known ones."""
+    for link in links:
+        if link not in known:
+            sentence = f"{what} names the link {link!r}, which does not exist"
+            raise error(f"{sentence}{suggest_names(link, known)}. Correct it")
+
+
 def make_end(
     constraint: str,
     end: str,
@@ -321,21 +331,22 @@ def build_tree(
     what: str,
 ) -> LinkTree:
     """Return the tree of links and joints; FileError for repeated names, or no single tree."""
-    named: dict[str, dict[str, int]] = {"joint": {}, "constraint": {}}
-    for sort, entry in (*(("joint", j) for j in joints), *(("constraint", c) for c in constraints)):
+    named: dict[str, set[str]] = {"joint": set(), "constraint": set()}
+    known = dict.fromkeys(links)
+    joined = [("joint", joint, (joint.parent, joint.child)) for joint in joints]
+    joined += [("constraint", c, tuple(end.parent for end in c.ends)) for c in constraints]
+    for sort, entry, _ in joined:
         if entry.name in named[sort]:
             raise FileError(f"duplicate {sort} {entry.name!r}. Rename one", path, entry.line)
         if (fault := find_fault(entry.name)) is not None:
             raise FileError(fault, path, entry.line)
-        named[sort][entry.name] = entry.line
+        named[sort].add(entry.name)
         XML_JOINTS.check(len(named[sort]), what, path, entry.line)
+    for sort, entry, ends in joined:
+        error = partial(FileError, path=path, line=entry.line)
+        require_links(known, f"{sort} {entry.name!r}", ends, error)
     carrier: dict[str, TreeJoint] = {}
-    known = set(links)
     for joint in joints:
-        for link in (joint.parent, joint.child):
-            if link not in known:
-                sentence = f"joint {joint.name!r} names the link {link!r}, which does not exist"
-                raise FileError(f"{sentence}. Correct it", path, joint.line)
         if joint.child in carrier:
             other = carrier[joint.child].name
             sentence = f"link {joint.child!r} is the child of {other!r} and of {joint.name!r}"
@@ -347,12 +358,6 @@ def build_tree(
         sentence = f"this {what.removesuffix(' file')} has {len(roots)} root links ({listed})"
         raise FileError(f"{sentence}. Allowed: one. Join them", path)
     _refuse_cycles(path, links, roots[0], carrier)
-    for constraint in constraints:
-        for link in (end.parent for end in constraint.ends):
-            if link not in known:
-                sentence = f"constraint {constraint.name!r} names the link {link!r}"
-                sentence += f", which does not exist{suggest_names(link, links)}"
-                raise FileError(f"{sentence}. Correct it", path, constraint.line)
     tree = {joint.name: joint for joint in joints}
     return LinkTree(path, text, tree, roots[0], carrier, tuple(constraints), motors, rewrite)
 
