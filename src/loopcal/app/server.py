@@ -179,7 +179,7 @@ class Handler(RequestHandler):
 
 
 async def serve(folder: Path, host: str, port: int, announce: Callable[[str, str], None]) -> None:
-    """Serve the project of a folder until the process is asked to end; `announce` gets the address
+    """Serve the project of a folder until the process is asked to end. `announce` gets the address
     to print, and one that opens once, as others may see the words with which a browser starts.
     """
     project, ended = Project(folder), asyncio.Event()
