@@ -41,9 +41,6 @@ struct ComparedTrial {
     const double *factor;
     int8_t *is_finite;
     int64_t n, max_iterations;
-
-    int64_t displacements() const { return structure[3]; }  // see program.h
-    int64_t drives() const { return structure[4] * (arrays[1].pose ? n : 1); }  // of all poses
 };
 
 // Close the loops from T and joints of a start, and fold the rows there.
@@ -133,33 +130,10 @@ inline bool is_regular(const double *R, double growth, double share, int64_t p, 
     return needed * root(inverse) < 1.0;
 }
 
-// Move e and q to a deviation, from those (base) at the first one by the map, which is the same
-// everywhere, or by the caller.
-inline int move_inputs(const ComparedTrial &in, const loopcal::Steps &steps, const double *z,
-                       const double *base) {
-    if (steps.move) return steps.move(z) ? loopcal::TASK_FAILED : loopcal::DONE;
-    int64_t a = in.structure[4], size = in.displacements(), functions = in.entries[1];
-    const loopcal::Strided &basis = in.arrays[5];
-    std::memcpy(steps.e, base, size_t(size) * sizeof(double));
-    std::memcpy(steps.q, base + size, size_t(in.drives()) * sizeof(double));
-    for (int64_t k = 0; k < steps.count; k++) {
-        const int64_t *pair = steps.displacements + 2 * k;
-        steps.e[pair[0]] += in.arrays[3].data[k] * (z[pair[1]] - steps.deviation[pair[1]]);
-    }
-    for (int64_t k = 0; k < steps.joint_count; k++) {
-        const int64_t *triple = steps.joints + 3 * k;
-        double change = in.arrays[4].data[k] * (z[triple[2]] - steps.deviation[triple[2]]);
-        const double *shape = basis.data + triple[0] * functions + triple[1];
-        for (int64_t i = 0; i * a < in.drives(); i++)
-            steps.q[i * a + triple[0]] += shape[i * basis.pose] * change;
-    }
-    return loopcal::DONE;
-}
-
 // Take full steps while each brings its share of the decrease that the linear model predicts, until
 // one is negligible: the rules of loopcal.estimate.descent. The result of step k is solved[k % 2].
 inline int take_steps(const ComparedTrial &in, const loopcal::SolvedPoses *solved,
-                      loopcal::Steps &steps, const double *base) {
+                      loopcal::Steps &steps) {
     int64_t p = in.entries[0], width = p + 1, corner = width * width;
     Arena arena(Arena::need<double>(corner + 3 * p) + Arena::need<double>(steps.height * width));
     if (!arena.ok()) return loopcal::NO_MEMORY;
@@ -181,10 +155,9 @@ inline int take_steps(const ComparedTrial &in, const loopcal::SolvedPoses *solve
         is_last |= root(square_length(x, p, 1)) <= steps.absolute * spread;
         if (is_last || steps.taken == steps.most) return loopcal::DONE;
         for (int64_t i = 0; i < p; i++) next[i] = z[i] + x[i];
-        int outcome = move_inputs(in, steps, next, base);
-        if (outcome != loopcal::DONE) return outcome;
+        if (steps.move(next)) return loopcal::TASK_FAILED;
         const loopcal::SolvedPoses &there = solved[(steps.taken + 1) % 2];
-        outcome = fold_at(in, {here.T, 0, 16}, here.strided, there);
+        int outcome = fold_at(in, {here.T, 0, 16}, here.strided, there);
         if (outcome != loopcal::DONE) return outcome;
         double after = square_length(there.factor + p, width, width), before = cost + penalty;
         double gained = before - (after + penalize(steps, next, p, nullptr)) + steps.rounding * before;
@@ -208,14 +181,9 @@ int fold_compared(const int64_t *structure, const double *numbers, const int64_t
     if (outcome != loopcal::DONE || !is_usable(in, solved[0], *steps)) return outcome;
     steps->taken = 0;
     if (!steps->most) return outcome;
-    int64_t p = entries[0], size = in.displacements(), moved = in.drives();
-    Arena arena(Arena::need<double>(size + moved));
-    if (!arena.ok()) return loopcal::NO_MEMORY;
-    double *base = arena.take<double>(size + moved);
-    std::memcpy(base, steps->e, size_t(size) * sizeof(double));
-    std::memcpy(base + size, steps->q, size_t(moved) * sizeof(double));
-    steps->cost[0] = square_length(solved[0].factor + p, p + 1, p + 1);
-    return take_steps(in, solved, *steps, base);
+    int64_t width = entries[0] + 1;
+    steps->cost[0] = square_length(solved[0].factor + width - 1, width, width);
+    return take_steps(in, solved, *steps);
 }
 
 }  // namespace INSTRUCTION_SET

@@ -56,18 +56,14 @@ struct ComparedPoses {
 // Moves e, q and the numbers of the map to a deviation (p,); a value other than 0 ends the call.
 typedef int (*Move)(const double *deviation);
 
-// Full Gauss-Newton steps of one trial, see loopcal.engine.Steps. e, q : what `arrays` are read from.
-// displacements (count, 2), joints (joint_count, 3) : pairs and triples of the map, by which e and q
-// move without `move`. penalty : (height, p). sign : (n,) that poses must keep.
-// Results: `taken` steps, -1 where the first poses cannot be used, deviations (most + 1, p), costs
-// (most + 1,), and the change of the residuals by the last step.
+// Full Gauss-Newton steps of one trial, see loopcal.engine.Steps. penalty : (height, p). sign : (n,)
+// that poses must keep. Results: `taken` steps, -1 where the first poses cannot be used, deviations
+// (most + 1, p), costs (most + 1,), and the change of the residuals by the last step.
 struct Steps {
-    int64_t most, height, count, joint_count;
+    int64_t most, height;
     double widest, relative, absolute, further, slowest, accepted, rounding, singular;
     const double *penalty;
     const int8_t *sign;
-    const int64_t *displacements, *joints;
-    double *e, *q;
     Move move;
     double *deviation, *cost;
     double change;

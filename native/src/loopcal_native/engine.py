@@ -403,13 +403,9 @@ class NativeFunctions:
             lists = (ctypes.addressof(a) for a in kept[-2:])
             solved[i] = SolvedPoses(T, next(lists), *others, next(lists), out)
         calls = MoveCalls(steps, [arrays[i] for i in (0, 1, 3, 4, 5)])
-        pattern = [
-            np.ascontiguousarray(a, np.int64)
-            for a in (inputs.pattern.displacements, inputs.pattern.joints)
-        ]
         taken = StepsOfLibrary(
-            *(steps.most, len(penalty), *map(len, pattern), *steps[3:-1]),
-            *(locate(a) for a in (penalty, sign, *pattern, *arrays[:2])),
+            *(steps.most, len(penalty), *steps[3:-1]),
+            *(locate(a) for a in (penalty, sign)),
             calls.function,
             *(locate(deviations), locate(costs), np.inf, -1),
         )

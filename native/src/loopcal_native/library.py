@@ -13,7 +13,7 @@ import numpy as np
 
 from loopcal.engine import Steps as StepsOfEngine
 
-ABI = 11
+ABI = 12
 """The C interface that this package calls; dispatch.cpp states it, too."""
 APART, CHAINED, ENDING = 0, 1, 2
 """Where `loopcal_solve` begins the poses of a trial; interface.h states it, too."""
@@ -68,9 +68,9 @@ class Steps(ctypes.Structure):
     """Full Gauss-Newton steps, see interface.h."""
 
     _fields_ = (
-        *((name, COUNT) for name in ("most", "height", "count", "joint_count")),
+        *((name, COUNT) for name in ("most", "height")),
         *((name, ctypes.c_double) for name in LIMITS),
-        *((name, ADDRESS) for name in ("penalty", "sign", "displacements", "joints", "e", "q")),
+        *((name, ADDRESS) for name in ("penalty", "sign")),
         ("move", MOVE),
         *((name, ADDRESS) for name in ("deviation", "cost")),
         ("change", ctypes.c_double),

@@ -415,7 +415,7 @@ class Steps(NamedTuple):
         expect, `slowest` at least from 1; or that is so long relative to 1 + |z|.
     accepted : share of the predicted decrease that a step must bring, with `rounding` of the sum.
     singular : share of |R| above which all singular values of R must certainly be.
-    move : from z (p,) to e, q and their map; None where the map is the same everywhere.
+    move : from z (p,) to e, q and their map; None without steps.
     """
 
     deviation: FloatArray

@@ -325,8 +325,7 @@ class PoseRows:
             e, tau, joints = drive_joints(robot, values, q)
             return e, joints, columns.linearize(values, tau, q)
 
-        moved = None if columns.is_constant else move
-        own = steps._replace(deviation=z[0], widest=WIDE * robot.size, move=moved)
+        own = steps._replace(deviation=z[0], widest=WIDE * robot.size, move=move)
         (e, joints, inputs), factor = move(z[0]), empty_factor(1, z.shape[1])
         at = robot.program, e, joints, begin.state, inputs, self.compared, own
         done = engine.fold_compared(factor, *at)

@@ -91,14 +91,6 @@ class ParameterUnits:
             return np.ones((1, 1, len(w), len(terms)))
         return np.stack(term_derivatives(q, tau, w, terms), axis=-1)
 
-    @property
-    def is_constant(self) -> bool:
-        """Whether `linearize` gives the same map at all values."""
-        terms, w = self.slots.terms[None], self.slots.constants
-        return not (self.slots.shared or len(find_triangles(terms))) and (
-            select_weights(terms, w) is None
-        )
-
     @cached_property
     def _entries(self) -> tuple[IntArray, IntArray, FloatArray]:
         """Slots that may move, by which column of all parameters, and its unit, (z,) each."""

@@ -134,7 +134,6 @@ def test_steps_have_the_same_bits_for_every_instruction_set(key, monkeypatch):
     case = make_cases()[key]
     (first, *_), *others = (record_steps(case, engine, monkeypatch) for engine in ENGINES)
     assert len(first[1].costs) > 2  # a hexapod takes two steps and a delta three
-    assert (first[0][-1].move is None) == (key == "hexapod")  # its map is the same everywhere
     for other, *_ in others:
         for ours, theirs in zip(first[1][1:], other[1][1:], strict=True):
             assert_array_equal(ours, theirs)
