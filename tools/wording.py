@@ -186,7 +186,7 @@ def list_strings(tree: ast.Module) -> Iterator[tuple[int, str]]:
     """Yield the texts of a module that are not docstrings, and docstrings of commands."""
     skipped: set[int] = set()
     for node in ast.walk(tree):
-        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
             decorators = [] if isinstance(node, ast.Module) else node.decorator_list
             is_command = any("command" in ast.unparse(d) for d in decorators)
             skipped |= {

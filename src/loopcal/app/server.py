@@ -179,8 +179,10 @@ class Handler(RequestHandler):
 
 
 async def serve(folder: Path, host: str, port: int, announce: Callable[[str, str], None]) -> None:
-    """Serve the project of a folder until the process is asked to end. `announce` gets the address
-    to print, and one that opens once, as others may see the words with which a browser starts.
+    """Serve the project of a folder until the process is asked to end.
+
+    announce : gets the address to print, and one that opens once, for the browser to start: other
+        users may see with which words it starts.
     """
     project, ended = Project(folder), asyncio.Event()
     token, once = secrets.token_urlsafe(24), secrets.token_urlsafe(24)
