@@ -93,8 +93,7 @@ class CheckUp(DrawnResult):
     checks : see `Check`. false_alarms : probability of any false alarm within a year of `a_year`
         checks. refitted : frames and other setup that each check determines for itself.
     units : of each quantity, in which its error is shown.
-    cause : parameters or limbs whose change explains the newest check; empty where the machine has
-        not changed, or where a pose or setup explains it.
+    cause : parameters or limbs whose change explains the newest check, and no pose or setup does.
     findings : whether the machine has changed, by the newest check.
     """
 

@@ -11,6 +11,7 @@ import queue
 import sys
 import threading
 from collections.abc import Iterator
+from contextlib import suppress
 
 from loopcal.cli.hints import with_hint
 from loopcal.cli.terminal import print_text, width
@@ -66,13 +67,10 @@ class Dialog(MeasuringSession):
         lines: queue.Queue[str | None] = queue.Queue()
 
         def read() -> None:
-            try:
+            with suppress(OSError):  # of a terminal that is gone
                 for line in iter(sys.stdin.readline, ""):
                     lines.put(line.strip())
-            except OSError:  # of a terminal that is gone
-                pass
-            finally:
-                lines.put(None)
+            lines.put(None)
 
         threading.Thread(target=read, daemon=True).start()
         while True:

@@ -139,9 +139,8 @@ def prepare_streams() -> None:
         except OSError:
             os.open(os.devnull, os.O_RDWR)  # the lowest free descriptor, which is this one
     codecs.register_error("loopcal", _express)
-    for name, mode, errors in (
-        ("stdin", "r", "backslashreplace"), ("stdout", "w", "loopcal"), ("stderr", "w", "loopcal")
-    ):  # fmt: skip
+    for name in ("stdin", "stdout", "stderr"):
+        mode, errors = ("r", "backslashreplace") if name == "stdin" else ("w", "loopcal")
         if getattr(sys, name) is None:
             stream = Path(os.devnull).open(mode, encoding="utf-8")  # noqa: SIM115 until the end
             setattr(sys, name, stream)

@@ -66,9 +66,8 @@ class ObservationRows:
         """Return some rows with poses renumbered: pose i becomes place[i]."""
         if len(rows) == len(self.poses):
             return replace(self, poses=place[self.poses])
-        at: Any = rows
-        if len(rows) and (np.diff(rows) == 1).all():  # a run of rows is not copied
-            at = slice(int(rows[0]), int(rows[-1]) + 1)
+        is_run = len(rows) > 0 and (np.diff(rows) == 1).all()  # which is not copied
+        at: Any = slice(int(rows[0]), int(rows[-1]) + 1) if is_run else rows
         selected = (self.measured[:, at], self.whitener[:, at], self.nuisance[at])
         factor = None if self.factor is None else self.factor[at]
         offset = None if self.offset is None else self.offset[:, at]
