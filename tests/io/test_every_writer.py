@@ -17,7 +17,6 @@ LIBRARY |= {"mkstemp", "fdopen", "mkdir", "makedirs", "hardlink_to", "copy2", "N
 
 USES_LIBRARY = {
     "cli/entry_point.py": "the report of a defect is for people, and must not fail",
-    "cli/terminal.py": "writes to the null device",
     "io/example_folders.py": "writes the files of a new folder",
     "io/core/outputs.py": "writes folders",
     "io/core/text_file.py": "writes files; makes, renames and restores temporary files",
