@@ -18,7 +18,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
@@ -54,11 +54,9 @@ from loopcal.mechanism.model import Mechanism
 from loopcal.numerics.decomposition import are_nonzero, decompose
 from loopcal.results.description import Field, each, fields, label_axes, pick
 from loopcal.results.result import DrawnResult, TableResult
+from loopcal.results.tables import Block, Table, build_table, word_column
 from loopcal.typing import FloatArray, IntArray, Progress, report_no_progress
 from loopcal.units import Dimension
-
-if TYPE_CHECKING:
-    from loopcal.results.tables import Block, Table
 
 
 @dataclass(frozen=True, eq=False)
@@ -354,8 +352,6 @@ class ModelChoice(TableResult):
 
     def compare_sets(self) -> Table:
         """Return the table of the sets, in which the chosen one is marked."""
-        from loopcal.results.tables import build_table, word_column
-
         return build_table(
             "Parameter sets: mean square error on held-out poses [sigma^2], conditioning",
             self.candidates,

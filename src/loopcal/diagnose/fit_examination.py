@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from enum import Enum
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -44,13 +44,9 @@ from loopcal.numerics.elimination import find_connected_groups
 from loopcal.numerics.statistics import compute_f_tail, find_distinct
 from loopcal.results.description import Field, fields
 from loopcal.results.result import Result
-from loopcal.results.tables import choose_unit
+from loopcal.results.tables import Block, choose_unit
 from loopcal.typing import Progress, report_no_progress
 from loopcal.units import Dimension
-
-if TYPE_CHECKING:
-    from loopcal.results.tables import Block
-
 
 STRONG = 0.9  # correlation above which one error is mostly another (81 % of its variance)
 

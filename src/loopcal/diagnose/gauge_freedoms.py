@@ -27,6 +27,7 @@ from loopcal.estimate.information import frame_twists
 from loopcal.estimate.linearization import spread_states
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
+from loopcal.mechanism.actuation import solve_at_pose
 from loopcal.mechanism.chains import get_platforms
 from loopcal.mechanism.kinematics import compute_readings, find_directly_reachable, forward_trials
 from loopcal.mechanism.model import Mechanism
@@ -367,8 +368,6 @@ def _probe_redundant(robot: Mechanism) -> FloatArray:
     Drawn readings would contradict each other, and those of home do so where the values are not
     those that home was computed with.
     """
-    from loopcal.mechanism.actuation import solve_at_pose
-
     scale = np.array([SPREAD_ANGLE] * 3 + [SPREAD_LENGTH * robot.size] * 3)
     twists = np.zeros((1, PROBES, 6))
     places = list(robot.program.freedoms)

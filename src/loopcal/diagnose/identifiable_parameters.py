@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -66,12 +66,9 @@ from loopcal.numerics.decomposition import (
 )
 from loopcal.results.description import Field, fields, label_axes
 from loopcal.results.result import DrawnResult, Result
+from loopcal.results.tables import Block
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import Dimension
-
-if TYPE_CHECKING:
-    from loopcal.results.tables import Block
-
 
 # Units of the singular values; every index depends on them.
 SCALING = "rows divided by sigma, columns multiplied by prior sd"

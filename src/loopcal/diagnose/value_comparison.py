@@ -19,7 +19,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -44,12 +44,9 @@ from loopcal.numerics.statistics import compute_f_tail
 from loopcal.results.deferred import DeferredFields, deferred, later
 from loopcal.results.description import Field, fields, label_axes
 from loopcal.results.result import TableResult
+from loopcal.results.tables import Block
 from loopcal.typing import FloatArray, IntArray
 from loopcal.units import Dimension
-
-if TYPE_CHECKING:
-    from loopcal.results.tables import Block
-
 
 # Poses at which machines are compared; without a stated workspace their distance from home: a
 # share of the robot's size, or radians.

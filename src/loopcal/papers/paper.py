@@ -23,6 +23,7 @@ from loopcal.errors import DataError, MechanismError, suggest_names
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.findings import report_finding
 from loopcal.findings.wording import list_names, round_to_digits
+from loopcal.io.core.yaml_file import format_yaml, parse_yaml, quote_scalar
 from loopcal.io.robot.robot_file import find_robot_file, load_robot
 from loopcal.mechanism.workspace import list_tilt_rings
 
@@ -130,7 +131,6 @@ class Paper:
 
     def load_study(self, robot: str = "") -> Study:
         """Return the study of a robot, or its file; default: of the first one of the paper."""
-        from loopcal.io.core.yaml_file import parse_yaml
         from loopcal.studies.files.study_file import load_study, parse_study
 
         if robot in ("", self.robots[0]):
@@ -271,7 +271,6 @@ def make_paper_study(paper: Paper, path: Path, robot: str | None = None) -> dict
     """Return the study file of a paper, for its robot or for another one (see `adapt_content`), and
     the file of its poses beside it, as path -> text.
     """
-    from loopcal.io.core.yaml_file import format_yaml, parse_yaml, quote_scalar
     from loopcal.studies.files.study_file import name_robot
 
     wanted, text = robot or paper.robots[0], paper.read_file(STUDY)

@@ -42,6 +42,7 @@ import numpy as np
 from loopcal.findings.wording import fill_template
 from loopcal.io.core.outputs import FolderKind, write_result_folder
 from loopcal.io.core.text_file import to_json
+from loopcal.io.core.yaml_file import read_yaml
 from loopcal.report.pictures import render_figure
 from loopcal.results import serialization
 from loopcal.results.description import Field, fields
@@ -216,8 +217,6 @@ class PaperFile:
 
 @cache
 def _read_file(module: str, name: str) -> dict[str, Any]:
-    from loopcal.io.core.yaml_file import read_yaml
-
     return read_yaml(Path(module).with_name(name), "file of a paper", has_names=False).content
 
 

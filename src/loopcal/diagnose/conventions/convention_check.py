@@ -17,10 +17,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
+from loopcal.diagnose.conventions.interpretations import Interpretation
 from loopcal.diagnose.conventions.misfit import (
     ALLOWED,
     BETTER,
@@ -60,10 +61,6 @@ from loopcal.mechanism.solutions import forward
 from loopcal.numerics.statistics import find_distinct
 from loopcal.results.description import Field, fields
 from loopcal.results.result import Result
-
-if TYPE_CHECKING:
-    from loopcal.diagnose.conventions.interpretations import Interpretation
-
 
 # Misfit above which conventions are in doubt. Tolerances exceeded three times, and a noise stated
 # three times too small, give about 3 each.

@@ -29,6 +29,7 @@ import numpy as np
 
 from loopcal.errors import DataError, FileError
 from loopcal.findings import Finding, Quantity, report_finding
+from loopcal.geometry import ANCHOR_RANK, solve_line_anchor
 from loopcal.io.core.text_file import read_json
 from loopcal.io.core.yaml_file import format_yaml
 from loopcal.io.formats.program_format import (
@@ -240,8 +241,6 @@ def estimate_anchors(samples: Samples, path: Path) -> FloatArray:
 
     FileError : no pose is known, or the known poses do not determine an anchor.
     """
-    from loopcal.geometry import ANCHOR_RANK, solve_line_anchor
-
     act = (
         f"Add known poses at several heights to {POSITIONS!r} (mm), or add the key {ANCHORS!r} (mm)"
     )

@@ -18,6 +18,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import permutations
 from pathlib import Path
 from typing import Any, Literal
@@ -34,6 +35,7 @@ from loopcal.io.formats.linkages.tree import (
     derive_end,
     draw_links,
     make_end,
+    require_links,
 )
 from loopcal.mechanism.joint_graph.graph import (
     Coupling,
@@ -242,12 +244,7 @@ def _read_pins(file: YamlFile, tree: LinkTree) -> tuple[Constraint, ...]:
             sentence = f"closure {i + 1} needs link_a, link_b, point and axis. Write all four"
             raise file.error(sentence, place)
         links, vectors = (str(entry["link_a"]), str(entry["link_b"])), []
-        for link in links:
-            if link not in drawn:
-                sentence = (
-                    f"closure {i + 1} names {link!r}, which is not a link of {tree.path.name}"
-                )
-                raise file.error(f"{sentence}{suggest_names(link, drawn)}. Correct it", place)
+        require_links(drawn, f"closure {i + 1}", links, partial(file.error, location=place))
         for key in ("point", "axis"):
             numbers = entry[key] if isinstance(entry[key], list) else []
             if [type(v) in (int, float) for v in numbers] != [True] * 3:
