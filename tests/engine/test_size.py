@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The NumPy engine is the specification of every other engine, so it stays readable in one sitting.
 
-The limit: ten files and 2,250 lines of at most 100 columns, about an hour of reading, with the
+The limit: ten files and 2,300 lines of at most 100 columns, about an hour of reading, with the
 docstrings that state shapes, units and formulas (a third of the lines). It was 800 lines until each
 attribute of a limb's chain was declared with its type, on a line of its own, 850 until rows could
 end near a known goal, by which `inverse` tests the working mode, 870 (five files) until limbs were
@@ -14,7 +14,8 @@ rows that close after their last step had none, a sixth of the time of forward k
 until trials that begin with a factor of zeros were folded by themselves, for bits of their own, and
 1,900 until bodies with three or more joints became nodes, which are eliminated one by one, and
 2,100 until joints that only couplings and the pose determine became one more node, and 2,200 until
-readings along a path were followed pose after pose in one call.
+readings along a path were followed pose after pose in one call, and 2,250 until full steps of a fit
+were one call, whose record states when they end.
 """
 
 import ast
@@ -27,10 +28,10 @@ def list_files(root: Path) -> list[Path]:
     return [folder / "program.py", *sorted((folder / "numpy_engine").glob("*.py"))]
 
 
-def test_engine_has_at_most_ten_files_and_2250_lines(root: Path):
+def test_engine_has_at_most_ten_files_and_2300_lines(root: Path):
     files = list_files(root)
     assert len(files) <= 10
-    assert sum(len(file.read_text("utf-8").splitlines()) for file in files) <= 2250
+    assert sum(len(file.read_text("utf-8").splitlines()) for file in files) <= 2300
 
 
 def test_engine_imports_numpy_only(root: Path):

@@ -187,7 +187,7 @@ def test_poses_have_the_coverage_of_six_degrees_of_freedom():
         lengths.append((np.linalg.norm(off, axis=1) <= result.expanded_position).mean())
         np.testing.assert_allclose(result.degrees.position, 6.0)
     assert result is not None
-    np.testing.assert_allclose(result.coverage_factor, student.ppf(0.97725, 6), rtol=1e-5)
+    np.testing.assert_allclose(result.coverage_factor, student.ppf(0.975, 6), rtol=1e-5)
     for shares in (held, lengths):
         assert np.mean(shares) > 0.925
         assert np.mean(shares) < 0.98

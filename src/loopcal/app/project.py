@@ -29,7 +29,7 @@ from loopcal.errors import DataError, FileError
 from loopcal.findings import Finding, report_finding
 from loopcal.io.core.csv_table import Cells, format_header, format_row, read_template
 from loopcal.io.core.limits import UPLOAD_SIZE, UPLOADS, make_name
-from loopcal.io.core.text_file import read_json, read_text, to_json, write_text
+from loopcal.io.core.text_file import read_json, read_text, to_json, write_bytes, write_text
 from loopcal.io.formats import FORMATS
 from loopcal.io.formats.import_export import list_formats, recognize_format
 from loopcal.io.robot.robot_file import list_shipped_robots
@@ -143,7 +143,7 @@ class Project:
         """Add a file, or replace that of its name."""
         name, kinds = clean_name(name), self.chosen.kinds
         UPLOADS.check(len({*kinds, name}), "page", name)
-        (self.folder / name).write_bytes(content)
+        write_bytes(self.folder / name, content)
         kind = recognize(self.folder / name)
         is_first = kind in KINDS or self.program in (None, name)
         kinds[name] = kind if is_first else "log"  # such as bed.g beside config.g
