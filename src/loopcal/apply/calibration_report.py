@@ -23,8 +23,11 @@ from loopcal.apply.height_errors import (
     measures_only_heights,
 )
 from loopcal.apply.validation import FEW_ROWS, Validation, store_differences
-from loopcal.diagnose.fit_examination import StartCheck, StartVerdict
+from loopcal.apply.volume_accuracy import VolumeAccuracy
+from loopcal.diagnose.conventions.convention_check import ConventionCheck
+from loopcal.diagnose.fit_examination import FitExamination, ReadingError, StartCheck, StartVerdict
 from loopcal.diagnose.gauge_freedoms import report_undetermined
+from loopcal.diagnose.value_comparison import ValueComparison
 from loopcal.errors import DataError
 from loopcal.estimate.residual_test import LEVEL, SIGNIFICANCE, ResidualTest
 from loopcal.estimate.result import Identification
@@ -46,12 +49,8 @@ from loopcal.units import Dimension
 if TYPE_CHECKING:
     from loopcal.apply.error_budget import ErrorBudget
     from loopcal.apply.repeatability import Repeatability
-    from loopcal.apply.volume_accuracy import VolumeAccuracy
-    from loopcal.diagnose.conventions.convention_check import ConventionCheck
     from loopcal.diagnose.cross_validation import ModelChoice
-    from loopcal.diagnose.fit_examination import FitExamination, ReadingError
     from loopcal.diagnose.identifiable_parameters import MeasurementSuggestion
-    from loopcal.diagnose.value_comparison import ValueComparison
     from loopcal.estimate.recalibration import Change
 
 TOP = 3  # findings that a summary shows

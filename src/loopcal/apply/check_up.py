@@ -29,7 +29,7 @@ from loopcal.apply.validation import (
     report_reused_rows,
 )
 from loopcal.diagnose.blunders import Predictor
-from loopcal.diagnose.row_errors import compare_predictions, compute_row_errors
+from loopcal.diagnose.row_errors import PoseErrors, compare_predictions, compute_row_errors
 from loopcal.errors import DataError, EstimationError
 from loopcal.estimate.fit_linearization import FitUncertainty
 from loopcal.estimate.recalibration import ErrorPart, JudgedChange, ParameterChanges, judge_change
@@ -44,14 +44,12 @@ from loopcal.numerics.elimination import eliminate_columns
 from loopcal.numerics.statistics import compute_f_tail, find_distinct
 from loopcal.results.description import Field, each, fields, label_axes, pick
 from loopcal.results.result import DrawnResult
-from loopcal.results.tables import Column, build_table, choose_unit, format_in
+from loopcal.results.tables import Block, Column, build_table, choose_unit, format_in
 from loopcal.typing import FloatArray
 from loopcal.units import Unit
 
 if TYPE_CHECKING:
-    from loopcal.diagnose.row_errors import PoseErrors
     from loopcal.io.runs.run_folder import Run
-    from loopcal.results.tables import Block
 
 A_YEAR, FALSE_ALARMS = 52, 0.05
 """Checks a year, and the probability of any false alarm within it."""

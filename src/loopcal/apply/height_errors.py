@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -35,15 +35,13 @@ from loopcal.measure.kinds.surfaces import Plane
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations
 from loopcal.mechanism.assembly import AXES
+from loopcal.mechanism.model import Mechanism
 from loopcal.numerics.statistics import compute_f_tail
 from loopcal.results.description import Field, fields
 from loopcal.results.result import DrawnResult
 from loopcal.results.storage import restore_arrays
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import Dimension, Unit
-
-if TYPE_CHECKING:
-    from loopcal.mechanism.model import Mechanism
 
 SHIFT_UNDECIDED, TILT_UNDECIDED = "workflow.height-shift", "workflow.height-tilt"
 PREFIX = "heights_"  # beginning of the names of the stored arrays

@@ -72,6 +72,11 @@ from loopcal.io.data.kind_settings import (
     read_stated_values,
 )
 from loopcal.io.robot.robot_file import check_format, list_shipped_robots, load_robot
+from loopcal.measure.data_checks import check_duplicates, check_kinds, check_strokes, check_types
+from loopcal.measure.kinds.kind import Kind
+from loopcal.measure.measurements import Measurements, list_moving_targets
+from loopcal.measure.observations import Observations
+from loopcal.measure.readings import solve_commanded_poses
 from loopcal.mechanism.assembly import FORCES
 from loopcal.mechanism.kinematics import load_readings
 from loopcal.mechanism.model import Mechanism
@@ -82,9 +87,6 @@ from loopcal.units import EXAMPLES, SMALLEST_SD, find_sd_fault, find_unit
 
 if TYPE_CHECKING:
     from loopcal.measure.instrument import Instrument
-    from loopcal.measure.kinds.kind import Kind
-    from loopcal.measure.measurements import Measurements
-    from loopcal.measure.observations import Observations
 
 # Fewest targets on the base that may determine the frame of an instrument. A single one shows no
 # rotation, and no other target would reveal its error.
@@ -125,8 +127,6 @@ def _check_base_targets(kinds: Sequence[tuple[Table, Sequence[KindRows]]]) -> No
     """Refuse a target on the base that is also on a platform, a single target on the base, and
     targets in a frame in which no pose is measured; FileError at the settings of the kind.
     """
-    from loopcal.measure.measurements import list_moving_targets
-
     all_kinds = [entry.kind for _, entries in kinds for entry in entries]
     known = {target for kind in all_kinds if kind.is_of_base for target in kind.target_columns}
     moving = [kind for kind in all_kinds if not kind.is_of_base]
@@ -308,8 +308,6 @@ def _read_file(table: Table, kinds: tuple[KindRows, ...], robot: Mechanism, seve
 
 def _read_readings(file: _File, robot: Mechanism, several: bool) -> _File:
     """Return a file with its readings, which a controller computes from commanded coordinates."""
-    from loopcal.measure.readings import solve_commanded_poses
-
     table, names = file.table, file.names
     controller = _load_controller(table, robot)
     columns = _list_reading_columns(table, robot, controller)
@@ -525,9 +523,6 @@ def join_tables(
     allow_duplicates: bool = False,
 ) -> Measurements:
     """Return the measurements of some tables; arguments as of `load_measurements`."""
-    from loopcal.measure.data_checks import check_duplicates, check_strokes
-    from loopcal.measure.measurements import Measurements
-
     several = len(tables) > 1
     kinds = [(table, read_kinds(table, robot, several)) for table in tables]
     if not any(of_file for _, of_file in kinds):
@@ -772,8 +767,6 @@ def save_measurements(
     FileError : the file cannot be written, or a file of settings has its name.
     DataError : a name that a file cannot hold.
     """
-    from loopcal.measure.data_checks import check_types
-
     path = as_path(path, "measurement file")
     check_types(robot, data)
     text = format_measurements(data, robot, remark)
@@ -791,8 +784,6 @@ def format_measurements(
     """Return the text of a measurement file; `states_use` also where no pose is held out, and
     `is_by_pose` for rows of all kinds in the order of their poses.
     """
-    from loopcal.measure.data_checks import check_kinds
-
     _refuse_names(data)
     observations = data.all_observations
     kinds = [rows.kind for rows in observations]
@@ -894,9 +885,6 @@ def format_data_sheet(
     `instrument` states the poses, session and group of each kind. Without `is_held_out` (n,), the
     file has no column `use`. DataError : a pose that does not exist, or a wrong number of names.
     """
-    from loopcal.measure.measurements import Measurements
-    from loopcal.measure.observations import Observations
-
     sensors = instrument.with_tool(robot).sensors
     rows = []
     for sensor in (sensor.assign_rows(len(np.asarray(readings))) for sensor in sensors):

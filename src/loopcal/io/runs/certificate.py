@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from importlib.resources import files
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 from xml.etree.ElementTree import Element, indent, register_namespace, tostring
 
 import numpy as np
@@ -23,15 +23,12 @@ import numpy as np
 from loopcal.errors import DataError
 from loopcal.io.core.records import read_record
 from loopcal.io.core.yaml_file import Location, name_location, read_yaml
-from loopcal.io.runs.run_folder import refuse_changed_run
+from loopcal.io.runs.run_folder import Run, refuse_changed_run
 from loopcal.measure.observations import is_date
 from loopcal.numerics.statistics import compute_f_quantile
 from loopcal.plain_text import escape
 from loopcal.results.tables import format_number, format_uncertainty, format_with_uncertainty
 from loopcal.units import NUMBER, Dimension, find_unit
-
-if TYPE_CHECKING:
-    from loopcal.io.runs.run_folder import Run
 
 # Unit of a condition of the environment -> unit in the D-SI.
 CONDITION_UNITS = {

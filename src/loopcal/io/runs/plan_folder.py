@@ -28,6 +28,9 @@ from loopcal.io.core.outputs import FolderKind
 from loopcal.io.core.text_file import open_bytes, read_json, sha256
 from loopcal.io.data.columns import COMMANDED, FIT, HELD_OUT, USE_COLUMN
 from loopcal.io.data.measurement_file import format_data_sheet, format_measurements
+from loopcal.measure.kinds.joints import Closure
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.observations import Observations
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import POSITION, get_dimension
 from loopcal.units import Dimension, find_unit
@@ -84,8 +87,6 @@ def format_plan_data(plan: Plan) -> str:
 
     They are empty where they are what is measured.
     """
-    from loopcal.measure.kinds.joints import Closure
-
     sensors = tuple(
         replace(s, rows=plan.poses.groups) if s.kind.poses_per_row > 1 else s
         for s in plan.instrument.sensors
@@ -194,9 +195,6 @@ def format_surface_sheet(plan: SurfacePlan) -> str:
 
 def format_surface_data(plan: SurfacePlan) -> str:
     """Return the data file to fill in: gaps are zero, readings empty, rows in pose order."""
-    from loopcal.measure.measurements import Measurements
-    from loopcal.measure.observations import Observations
-
     robot = plan.robot
     observations = []
     for sensor in plan.instrument.sensors:

@@ -34,6 +34,11 @@ import numpy as np
 
 from loopcal.engine import collect_versions
 from loopcal.errors import DataError, EstimationError, FileError
+from loopcal.estimate.free_parameters import free_only
+from loopcal.estimate.options import FitOptions
+from loopcal.estimate.posterior import Posterior, posterior_from_arrays
+from loopcal.estimate.residual_test import NoiseKnowledge
+from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
 from loopcal.io.core.limits import ARRAYS_COUNT, ARRAYS_SIZE, TABLE_SIZE, FileLimit
 from loopcal.io.core.outputs import (
@@ -54,20 +59,17 @@ from loopcal.io.robot.robot_file import (
     load_robot,
     remove_mark,
 )
+from loopcal.measure.fitted_rows import FittedRows, fitted_rows_from_arrays
+from loopcal.measure.measurements import Measurements
 from loopcal.mechanism.model import Mechanism
 from loopcal.results.result import Result
 from loopcal.results.serialization import json_fields
-from loopcal.typing import report_no_progress
+from loopcal.typing import Progress, report_no_progress
 from loopcal.units import UNITS
 
 if TYPE_CHECKING:
     from loopcal.apply.calibration_report import CalibrationReport
     from loopcal.estimate.fit_linearization import FitUncertainty
-    from loopcal.estimate.posterior import Posterior
-    from loopcal.estimate.result import Identification
-    from loopcal.measure.fitted_rows import FittedRows
-    from loopcal.measure.measurements import Measurements
-    from loopcal.typing import Progress
 
 RESULT = "result.json"
 FORMAT = 2
@@ -459,8 +461,6 @@ class Run(Result):
         """The robot with only those parameters free that the run identified; its file leaves the
         others free, too.
         """
-        from loopcal.estimate.free_parameters import free_only
-
         names = [row["name"] for row in self.result["fit"]["parameters"]]
         return free_only(self.robot, names)
 
@@ -469,8 +469,6 @@ class Run(Result):
         """The rows that the run, and those that are its prior, were fitted to; None for a robot
         file.
         """
-        from loopcal.measure.fitted_rows import fitted_rows_from_arrays
-
         return fitted_rows_from_arrays(self.arrays)
 
     @property
@@ -490,8 +488,6 @@ class Run(Result):
         ------
         EstimationError : it is a robot file, or its robot file was changed.
         """
-        from loopcal.estimate.posterior import posterior_from_arrays
-
         return posterior_from_arrays(self.identified_robot, self.arrays)
 
     def load_stated_errors(self) -> Posterior:
@@ -513,7 +509,6 @@ class Run(Result):
         measurements; None for a robot file.
         """
         from loopcal.estimate.fit_linearization import uncertainty_from_arrays
-        from loopcal.estimate.residual_test import NoiseKnowledge
 
         if not self.result:
             return None
@@ -577,7 +572,6 @@ def repeat_fit(
         name. FileError : see `Run.load_measurements`.
     """
     from loopcal.estimate.identification import identify
-    from loopcal.estimate.options import FitOptions
     from loopcal.estimate.recalibration import recalibrate
 
     stated = run.result["options"]
