@@ -7,7 +7,6 @@ around it is written by hand.
 """
 
 import dataclasses
-import inspect
 import re
 import sys
 from collections import Counter
@@ -41,8 +40,7 @@ BLOCK = r"made by tools.file_reference: (?P<name>[\w-]+)"
 
 def summarize(record: type) -> str:
     """Return the text of a record's docstring above its sections."""
-    text = file_reference.SECTION.split(inspect.cleandoc(record.__doc__ or ""))[0]
-    return file_reference.SI.sub("", " ".join(text.split()))
+    return file_reference.SI.sub("", " ".join(file_reference.split_docstring(record)[0].split()))
 
 
 def list_nested_records(record: type) -> tuple[type, ...]:

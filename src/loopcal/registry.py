@@ -59,8 +59,6 @@ class Registry(Mapping[str, T]):
         It replaces an earlier entry of this name, as when a notebook executes a cell again, but
         none of loopcal itself.
 
-        Raises
-        ------
         DataError : the entry has no name, or the name of an entry of loopcal.
         """
         name = getattr(entry, "name", None)

@@ -308,8 +308,6 @@ class PictureTask:
 class Picture:
     """What a picture shows.
 
-    Parameters
-    ----------
     path : the file. size : width and height. focal : focal length by EXIF [px]; None without.
     corners : (n,) numbers. pixels : (n, 2), pixel (0, 0) being the middle of the first one.
     blur : standard deviation of the blur of edges [px], in the worse direction; NaN if unknown.
@@ -489,8 +487,6 @@ def name_poses(paths: Sequence[Path], names: Path | None = None) -> dict[Path, s
     A table with the column `picture` assigns names of files. Otherwise the pictures have the names
     of its poses, or are as many as its poses and in their order.
 
-    Raises
-    ------
     FileError : the table does not fit the pictures.
     """
     if names is None:

@@ -59,8 +59,6 @@ class Robot:
 class InstrumentLevel(Limited):
     """An instrument, as the command line and `build_instrument` describe it.
 
-    Parameters
-    ----------
     kinds : kinds of measurement. components : coordinates that the kind `component` measures.
     orientation : form of measured angles. sigma_position, sigma_angle : standard deviation of each
         length and each angle, by default 10 um and 50 urad.
@@ -97,8 +95,6 @@ class NoiseLevel(Limited):
 class PosesLevel(Limited):
     """The measured poses.
 
-    Parameters
-    ----------
     count : number of poses. choice : "random" draws them evenly from the workspace, "planned" plans
         them for the robot and the instrument, "tilts" puts them on three rings of equal tilt,
         "plane-line" on planes and perpendicular lines for an instrument of the kinds plane and
@@ -146,8 +142,6 @@ class PosesLevel(Limited):
 class ErrorsLevel(Limited):
     """The errors of the true machines, and their tolerances in the fit.
 
-    Parameters
-    ----------
     tolerance_factor : on the tolerances, which the fit knows.
     error_factor : true errors over tolerances, which the fit does not know.
     distribution : of the errors. A tolerance is their standard deviation in both. Uniform errors
@@ -188,8 +182,6 @@ class ErrorsLevel(Limited):
 class MethodLevel(Limited):
     """Estimation of the parameters.
 
-    Parameters
-    ----------
     method : "auto" is the default of `identify`, see `loopcal.estimate.methods`. "per-leg"
         identifies a hexapod leg by leg from full poses, as a published study does.
     lam : weight of the penalty of ridge, or one by name or pattern of parameters, such as `{"*":
@@ -309,8 +301,6 @@ class Outliers(Limited):
 class ThermalGrowth:
     """The machine's lengths grow during the measurement.
 
-    Parameters
-    ----------
     expansion : of lengths, per kelvin. rise : temperature of the last pose over the first [K]. It
         rises linearly, with the mean of the nominal machine.
     """
@@ -333,8 +323,6 @@ class Backlash:
 class EffectsLevel(Limited):
     """What happens although the fit does not know of it. The defaults change nothing.
 
-    Parameters
-    ----------
     noise : true sigma over the sigma of the fit. degrees : of Student's t noise (default: the
         distribution of the instrument). correlation : of the noise of a row with the noise of the
         row before.
@@ -361,8 +349,6 @@ class EffectsLevel(Limited):
 class Scores(Limited):
     """Results of every trial.
 
-    Parameters
-    ----------
     held_out : number of poses for the errors, drawn from the workspace and not measured. frame : of
         the errors, "fitted" or "base", or "both": also errors in the base frame as further scores.
     intervals : "stated" computes them from the stated noise, for all trials of a block at once.
@@ -397,8 +383,6 @@ class Question(Limited):
     """A question that the summary answers: which is the smallest or the largest level of a factor
     with which a score stays within a limit on a share of the machines.
 
-    Parameters
-    ----------
     factor : name of the factor, such as "poses" or "noise". score : name of a score, such as
         "position". limit : of the score, with its unit if it has one. share : of the machines.
     wanted : "smallest" or "largest" level that reaches it.
@@ -662,8 +646,6 @@ MOST_TRIALS = 2000  # largest number of trials of a block
 class StudySettings(Limited):
     """The settings of a study file beside its factors.
 
-    Parameters
-    ----------
     title : what the study is about. seed : of all random numbers, 0 or more.
     replicates : trials of each cell. block : trials of a block, the unit of work; at most 2000, as
         a block of a hexapod needs about half a megabyte of memory for each trial.

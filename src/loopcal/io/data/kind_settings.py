@@ -99,8 +99,6 @@ MOST_K = 10.0  # largest coverage factor
 class Uncertainty:
     """An uncertainty: a standard deviation, a limit, or an expanded uncertainty.
 
-    Parameters
-    ----------
     sd : standard deviation. limit : half of the width within which the value is uniform.
     U : expanded uncertainty, `k` standard deviations.
     """

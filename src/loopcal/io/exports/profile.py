@@ -138,8 +138,6 @@ TARGET = "{target}"  # part of a name in the header that stands for each target
 class ColumnSource:
     """The source of one column of the measurement file.
 
-    Parameters
-    ----------
     from_ : name in the export's header, or place counted from 1. Blanks join several.
         `{target}` in a name stands for each target, if a line has the columns of all of them.
     unit : unit of a number.
@@ -206,8 +204,6 @@ class ColumnSource:
 class ProfileRecord:
     """The keys of a profile.
 
-    Parameters
-    ----------
     delimiter : separator of columns (`spaces`: any number of blanks and tabs).
     columns : column of the measurement file -> its source.
     settings : settings of the measurement file (docs/files.md). `poses` names the file with the

@@ -144,8 +144,6 @@ SHIPPED_ROBOTS = Path(__file__).parents[2] / "robots"
 class RobotSource(NamedTuple):
     """The origin of a loaded robot, kept as its `record`.
 
-    Parameters
-    ----------
     file : the robot file. record : the family's record, in SI.
     """
 
@@ -385,9 +383,11 @@ def load_stored_values(path: str | Path, robot: Mechanism) -> dict[str, float] |
 
 # Reference of file keys, taken from the records that read them: types, defaults, docstrings.
 
-SECTION = re.compile(
-    r"^(Attributes|Examples|Notes|Parameters|Raises|Returns)\n-{3,}\n", re.MULTILINE
+# Where the entries of a docstring begin, with or without a heading, and sections behind them.
+ENTRIES = re.compile(
+    r"^(?:Attributes|Parameters)\n-{3,}\n|(?:\A|\n\n)(?=(?:\w+, )*\w+ :\s)", re.MULTILINE
 )
+BEHIND = re.compile(r"^(?:Examples|Notes|Raises|Returns)\n-{3,}\n", re.MULTILINE)
 SHORT = re.compile(r"(?:^ *|(?<=[.;] ))((?:\w+, )*\w+) :\s", re.MULTILINE)
 SI = re.compile(r" \[(?:m|rad|m per turn|m, rad|m or rad)\]")
 ELSEWHERE = re.compile(r"(?:Others: )?[Ss]ee (?:`\w+`|the module)(?:, |; |\. ?|$)")
@@ -397,8 +397,6 @@ ELSEWHERE = re.compile(r"(?:Others: )?[Ss]ee (?:`\w+`|the module)(?:, |; |\. ?|$
 class Key:
     """A key of a file.
 
-    Parameters
-    ----------
     name : as written. holds : its type, such as `length`, `[x, y]`, or the name of a record.
     default : value without the key, "needed" where the key is mandatory, "" where it is empty.
     meaning : phrase of the docstring, possibly empty.
@@ -422,17 +420,19 @@ def list_keys(record: type) -> tuple[Key, ...]:
     )
 
 
+def split_docstring(record: type) -> tuple[str, str]:
+    """Return the text of a docstring above its entries `name : phrase`, and the entries."""
+    above, *entries = ENTRIES.split(BEHIND.split(inspect.cleandoc(record.__doc__ or ""))[0], 1)
+    return above, "".join(entries)
+
+
 def collect_meanings(record: type) -> dict[str, str]:
-    """Return name -> phrase from the Attributes and Parameters sections of the docstrings of a
-    record and of its bases, from entries `name : phrase`, of which several may share a line.
-    Phrases that only point elsewhere are left out.
+    """Return name -> phrase from the docstrings of a record and of its bases, from entries `name :
+    phrase`, of which several may share a line. Phrases that only point elsewhere are left out.
     """
     meanings: dict[str, str] = {}
     for base in reversed(record.__mro__):
-        titles_and_bodies = SECTION.split(inspect.cleandoc(base.__doc__ or ""))
-        sections = zip(titles_and_bodies[1::2], titles_and_bodies[2::2], strict=True)
-        text = "".join(body for title, body in sections if title in ("Attributes", "Parameters"))
-        _, *names_and_phrases = SHORT.split(text)
+        _, *names_and_phrases = SHORT.split(split_docstring(base)[1])
         for names, written in zip(names_and_phrases[::2], names_and_phrases[1::2], strict=True):
             phrase = ELSEWHERE.sub("", SI.sub("", " ".join(written.split()))).rstrip(". ")
             named = (name.removesuffix("_") for name in names.split(", "))

@@ -45,8 +45,6 @@ def load_targets(path: str | Path, robot: Mechanism) -> tuple[FloatArray, tuple[
     targets : (n, c) [m, rad], in the robot's order.
     labels : (n,) cells of the column `pose`; "1", "2", ... without it.
 
-    Raises
-    ------
     FileError : a value that does not fit, at its line.
     """
     table = read_table(path)

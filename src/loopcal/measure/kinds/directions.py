@@ -42,8 +42,6 @@ class DirectionKind(Kind):
     of a sensor on the platform. With s the rotation of S: `dd = S' (dQ a) + S' Q da + S' (Q a x
     s)`, where `dR a = omega x R a`, `dR' a = R' (a x omega)`.
 
-    Parameters
-    ----------
     unknown : which of `allowed_unknown`, (orientation, direction), are unknown: three and two
         numbers. One value holds for a session.
     """
@@ -133,8 +131,6 @@ class DirectionKind(Kind):
 class AxisKind(DirectionKind):
     """A kind that measures an axis of the platform in the frame of an instrument.
 
-    Parameters
-    ----------
     T_base_frame : (4, 4), frame of the instrument in the base; only its orientation matters.
     frame : name of the frame. Kinds that use the same name share its parameters.
     Others : see `DirectionKind`.

@@ -330,8 +330,6 @@ class Image(Kind):
     `fy`, `cx`, `cy` [px], `k1`, `k2`, `k3`, `p1`, `p2`, `board.scale_x`, `board.scale_y`, and
     `board.bend_x`, `bend_y`, `bend_xy` [m].
 
-    Parameters
-    ----------
     mount : what the platform carries, the "board" or the "camera". The base carries the other one.
     T_camera, T_board : (4, 4), camera and board in the body that carries them (platform or base).
         If unknown, the nominal values.
@@ -344,8 +342,6 @@ class Image(Kind):
     unknown : which of "camera", "board", "focal", "center", "radial" (k1, k2, k3), "tangential"
         (p1, p2), "print" (the scales) and "bend" are unknown.
 
-    Raises
-    ------
     DataError : another mount, a board with fewer than two corners a side, or a length not above 0.
     """
 

@@ -41,8 +41,6 @@ SINGULAR_RATES = 1e-3
 class ToolKind(Kind):
     """A kind that measures the tool in the frame of the instrument.
 
-    Parameters
-    ----------
     T_base_frame : (4, 4), frame of the instrument in the base; default: the base itself. If it is
         unknown, its nominal value.
     T_platform_tool : (4, 4), tool on the platform; default: the tool of the robot.

@@ -31,8 +31,6 @@ from loopcal.units import Dimension, Length
 class SurfaceKind(TargetKind):
     """A kind that touches a surface, which is stated by a point and a direction.
 
-    Parameters
-    ----------
     through : (3,) [m], a point of the surface (of a sphere: its center) in the frame. If the
         surface is unknown, its nominal value.
     along : (3,), normal of a plane or direction of a line, in the frame; of any length.

@@ -50,8 +50,6 @@ Direction = tuple[Ratio, Ratio, Ratio]
 class Screw:
     """Screws in the legs of a hexapod.
 
-    Attributes
-    ----------
     lead : change of length in one turn [m], one for all legs or one each; negative for a
         left-handed screw.
     base_axes, platform_axes : direction of the joint axis fixed to the base (platform), leg by leg.
@@ -157,8 +155,6 @@ class GoughCones:
 class Gough(RobotRecord):
     """The file of a hexapod.
 
-    Attributes
-    ----------
     base, platform : centers of the joints, leg by leg, in the base and the platform frame [m].
     lengths : length of a leg at reading zero [m], one for all or one each.
     stroke : allowed readings (low, high) [m]. cones : of the joints of rods.

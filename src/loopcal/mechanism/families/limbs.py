@@ -207,8 +207,6 @@ class RodCone:
 class BodyRecord:
     """A further body inside the loops that limbs join.
 
-    Attributes
-    ----------
     home : first guess of its pose in the base at home. Without it the joints of a rigid limb, at
         their `start`, place the body.
     copies : repeat the body around an axis. Copy i of a limb that names it joins copy i of the
@@ -224,8 +222,6 @@ class BodyRecord:
 class LimbRecord:
     """A limb: joints from one body on, then its ending on another one.
 
-    Attributes
-    ----------
     on, to : the bodies where it begins and ends: `base`, `platform`, or one of `bodies:`.
     chain : its joints. tip : its end, in the last carried frame, or without joints its point on the
         first body.
@@ -255,8 +251,6 @@ class LimbRecord:
 class Limbs(RobotRecord):
     """The file of a mechanism of any limbs.
 
-    Attributes
-    ----------
     freedoms : of the platform, in base axes. controlled : coordinates in which it is commanded.
     bodies : further bodies. limbs : from body to body. error_model : see the
         module. tolerances : of the complete model. closure : how over-constrained loops

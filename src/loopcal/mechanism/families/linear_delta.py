@@ -82,8 +82,6 @@ def _compute_rise(arm: FloatArray, radius: FloatArray) -> FloatArray:
 class LinearDelta(RobotRecord):
     """The file of a linear delta.
 
-    Attributes
-    ----------
     radius : horizontal distance of a rod's ends with the nozzle in the center [m].
     angles : of the towers [rad]; the third one defines the base frame's x axis and is fixed.
     arms : lengths of the rods [m], one or three. stops : end-stop heights [m], one or three.

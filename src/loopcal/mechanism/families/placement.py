@@ -48,8 +48,6 @@ class RecordError(MechanismError):
 class JointPlacement:
     """A joint of a limb, and where it is; the link before it has its name.
 
-    Attributes
-    ----------
     place : (4, 4) of the joint in the frame carried up to it [m].
     axis : (3,) in the placed frame, of any length but zero.
     """
@@ -62,8 +60,6 @@ class JointPlacement:
 class PlacedLimb(NamedTuple):
     """A limb for the engine, with the frames in which its file is written.
 
-    Attributes
-    ----------
     rotations : name of a link -> (3, 3) R_carried_link, from the link's axes to the carried ones.
     placements : name of a link -> (4, 4) its placement in the frame carried before it [m].
     stem : name without the number of a copy.

@@ -147,8 +147,6 @@ LEFT_OUT = ("thOz", "thU1z")  # parameters of the twenty-seven that the twenty-f
 class CarriageRobot(RobotRecord):
     """The keys of robots with carriages.
 
-    Attributes
-    ----------
     platform_radius, base_radius, rod : a, b and l [m]. stroke : allowed readings (low, high) [m].
     error_model : `ideal`, the named parameters, or `complete`.
     spherical : joints at the upper ends of rods, of a PUS limb at both, as perfect `point`s, or
@@ -185,8 +183,6 @@ class CarriageRobot(RobotRecord):
 class RuPusPrs(CarriageRobot):
     """The file of an RU-PUS-PRS tracker.
 
-    Attributes
-    ----------
     post : its length r [m]. parameter_set : with `ideal`, the set (see the module).
     """
 
@@ -233,8 +229,6 @@ class RuPusPrs(CarriageRobot):
 class ThreePrs(CarriageRobot):
     """The file of a 3-PRS tripod.
 
-    Attributes
-    ----------
     parameter_set : with `ideal`, the `eleven` identifiable ones of each chain, or all `fourteen`.
     """
 

@@ -217,8 +217,6 @@ def _map_entry(
 class CommonErrorRecord:
     """An error that several parameters share in addition to their own, such as one batch.
 
-    Attributes
-    ----------
     name : of the common error. of : the parameters, by name or pattern, such as `arm*.length`.
     length, angle, ratio : the tolerance of the common error, by the dimension of the parameters.
     """
@@ -309,8 +307,6 @@ class Workspace:
 class RobotRecord:
     """The fields of every robot file; a family adds its own fields and `expand`.
 
-    Attributes
-    ----------
     name : name of the robot. source : origin of its numbers.
     home : platform pose in the base at which loopcal closes the loops first (default: zero).
     tool : tool pose on the platform. workspace : region of work, from which loopcal draws poses.

@@ -258,8 +258,6 @@ LIMB, LINK, PASSIVE = "serial", "joint", "none"
 class SerialJoint:
     """What every serial joint can state.
 
-    Attributes
-    ----------
     at : its place on the platform that carries it. axis : direction in the placed frame.
     tip : platform of this stage in the placed frame, at joint value zero.
     start : reading at home, with a triangle the angle of the joint. stroke : allowed readings.
@@ -290,8 +288,6 @@ class SerialJoint:
 class SerialRotation(SerialJoint):
     """A driven rotary joint as a separate stage.
 
-    Attributes
-    ----------
     drive : name of its actuator (default: of the stage), or `none` of a joint that couplings move.
         Or a linear actuator that turns it, `{triangle: ..}`, which states its own stroke, gain,
         sigma and unknowns.
@@ -307,8 +303,6 @@ class SerialRotation(SerialJoint):
 class SerialSlide(SerialJoint):
     """A driven slide as a separate stage.
 
-    Attributes
-    ----------
     drive : name of its actuator (default: of the stage), or `none` of a joint that couplings move.
     """
 
@@ -320,8 +314,6 @@ class SerialSlide(SerialJoint):
 class StageRecord:
     """A stage: a serial joint, or a robot of another family with the keys of that family.
 
-    Attributes
-    ----------
     on : the stage whose platform carries it, or `base`; default: the previous stage.
     mount : its base on that platform. joint : a serial joint. family : of any other stage.
     """
@@ -339,8 +331,6 @@ class StageRecord:
 class Stages(RobotRecord):
     """The file of a chain of stages.
 
-    Attributes
-    ----------
     controlled : commanded coordinates of the end platform, one for each freedom that its actuators
         give it. held : actuators that inverse kinematics leaves at their present readings. stages :
         from the base on. The last one carries the end platform.
