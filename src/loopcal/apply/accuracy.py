@@ -310,7 +310,7 @@ def transport(robot: Mechanism, T: FloatArray, axes: Axes, point: Point) -> Floa
     return geometry.transport_matrix(arm, R.swapaxes(1, 2) if axes == "platform" else None)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class AccuracyMap(DrawnResult):
     """Uncertainty over the workspace, and at the measured poses.
 
@@ -375,8 +375,6 @@ class AccuracyMap(DrawnResult):
             [*lines, f"{count} of {n} poses are less certain than every measured pose"]
         )
 
-    __repr__ = __str__
-
 
 def accuracy_map(
     fit: Identification | Posterior,
@@ -422,7 +420,7 @@ def _ratio(values: FloatArray, reference: FloatArray) -> FloatArray:
         return np.where(values == largest, 1.0, values / largest)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class AccuracySimulation(TableResult):
     """Predicted and observed errors of n poses.
 
@@ -447,8 +445,6 @@ class AccuracySimulation(TableResult):
 
     def __str__(self) -> str:
         return f"{self.trials} trials, {self.failed} did not converge; {self.predicted.frame}"
-
-    __repr__ = __str__
 
     @property
     def ratio(self) -> FloatArray:

@@ -395,7 +395,7 @@ def _count_fitted_poses(fit: Identification, data: Measurements) -> int:
     return int(is_measured.sum())
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class CalibrationReport(DeferredFields, TableResult):
     """The result of `calibrate`. Its budget is computed when it is first asked for.
 
@@ -482,11 +482,6 @@ class CalibrationReport(DeferredFields, TableResult):
     def exit_code(self) -> int:
         """2 where a quality gate is not met, be it that of a limit, else 0."""
         return 2 if self.failures else 0
-
-    @property
-    def failures(self) -> tuple[Finding, ...]:
-        """Findings of quality gates that are not met."""
-        return tuple(f for f in self.findings if f.severity is Severity.FAILURE)
 
     @cached_property
     def repeatability(self) -> Repeatability | None:
@@ -587,9 +582,6 @@ class CalibrationReport(DeferredFields, TableResult):
             f"from {name_count(fitted, 'pose')}."
             + (f" The limit of {' and '.join(missed)} fails." if missed else "")
         )
-
-    def __repr__(self) -> str:
-        return str(self)
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Return arrays to store [SI]: those of the fit, the `initial` values of all parameters,

@@ -34,7 +34,7 @@ from loopcal.errors import DataError, EstimationError
 from loopcal.estimate.fit_linearization import FitUncertainty
 from loopcal.estimate.recalibration import ErrorPart, JudgedChange, ParameterChanges, judge_change
 from loopcal.estimate.residual_test import DOUBT
-from loopcal.findings import Finding, Severity, report_finding
+from loopcal.findings import Finding, report_finding
 from loopcal.measure.data_checks import check_actuators, check_types
 from loopcal.measure.fitted_rows import FittedRows, collect_fitted_rows
 from loopcal.measure.kinds.kind import SCALES
@@ -82,7 +82,7 @@ class Check:
     )
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class CheckUp(DrawnResult):
     """A calibration against checks in the order of time.
 
@@ -130,16 +130,9 @@ class CheckUp(DrawnResult):
         """Whether the newest check says that the machine has changed."""
         return self.checks[-1].alarm
 
-    @property
-    def failures(self) -> tuple[Finding, ...]:
-        """Findings by which the calibration no longer holds."""
-        return tuple(f for f in self.findings if f.severity is Severity.FAILURE)
-
     def __str__(self) -> str:
         """Return the findings, one on each line."""
         return "\n".join(f"{f.severity.value}: {f}" for f in self.findings)
-
-    __repr__ = __str__
 
 
 def _format_error(check: Check, quantity: str, unit: Unit) -> str:

@@ -108,7 +108,7 @@ CODES = {
 }
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Compensation(TableResult):
     """Readings or commands for n targets, and the poses they lead to.
 
@@ -204,8 +204,6 @@ class Compensation(TableResult):
         if self.residual_map is not None:
             lines.append(str(self.residual_map))
         return "\n".join(lines)
-
-    __repr__ = __str__
 
 
 def compensate(

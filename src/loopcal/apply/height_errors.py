@@ -58,7 +58,7 @@ LEAST_SHARE = 0.1  # least share of a tilted plane in the squares of heights tha
 UPRIGHT = 0.95  # least cosine of the angle between the z axes of the measured frame and of the base
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class HeightErrors(DrawnResult):
     """Errors of n measured heights, prediction minus measurement, at their places x, y.
 
@@ -135,9 +135,6 @@ class HeightErrors(DrawnResult):
         for name, is_held_out in (("fitted", False), ("held-out", True)):
             if (self.is_held_out == is_held_out).any():
                 yield name, is_held_out
-
-    def __repr__(self) -> str:
-        return str(self)
 
 
 def map_height_errors(

@@ -116,7 +116,7 @@ class RunSummary:
     plus_minus: dict[str, float | None]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class RunComparison(DrawnResult):
     """Calibrations side by side; the first one is the reference of all others.
 
@@ -168,9 +168,6 @@ class RunComparison(DrawnResult):
         """Whether any machine differs from that of the first run; None where nothing was tested."""
         answers = [pair.moved for pair in self.pairs if pair.moved is not None]
         return any(answers) if answers else None
-
-    def __repr__(self) -> str:
-        return str(self)
 
 
 def compare_runs(runs: Sequence[Run], data: Measurements | None = None) -> RunComparison:

@@ -116,7 +116,7 @@ class ErrorChange:
         return self.after > GREW * self.before and self.after > self.largest_noise
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Validation(DrawnResult):
     """Errors on measured poses before and after calibration, over the r rows of all kinds.
 
@@ -185,11 +185,6 @@ class Validation(DrawnResult):
             for i, name in enumerate(("pose", "target", "quantity", "unit", "before", "after"))
         ),
     )
-
-    @property
-    def failures(self) -> tuple[Finding, ...]:
-        """Findings of limits that are exceeded or cannot be checked."""
-        return tuple(f for f in self.findings if f.severity is Severity.FAILURE)
 
     @property
     def passed(self) -> bool:
@@ -274,9 +269,6 @@ class Validation(DrawnResult):
                 strict=True,
             )
         ]
-
-    def __repr__(self) -> str:
-        return str(self)
 
     @property
     def checked(self) -> Validation:

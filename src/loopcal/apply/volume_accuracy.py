@@ -36,7 +36,7 @@ from loopcal.errors import DataError, EstimationError, UnitError
 from loopcal.estimate.posterior import Posterior
 from loopcal.estimate.residual_test import LEVEL
 from loopcal.estimate.result import Identification
-from loopcal.findings import Finding, Severity, report_finding
+from loopcal.findings import Finding, report_finding
 from loopcal.findings.catalog import word_phrase
 from loopcal.measure.array_checks import check_array
 from loopcal.measure.instrument import make_random_stream
@@ -239,7 +239,7 @@ def join_volume(parts: Iterable[tuple[str, Any]]) -> Volume:
     return Volume(ranges, {n: x for n, x in stated.items() if n not in ranges}, **others)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class VolumeAccuracy(Result):
     """The largest position error in a volume, with a coverage probability of 95 %.
 
@@ -282,13 +282,6 @@ class VolumeAccuracy(Result):
 
     def __str__(self) -> str:
         return "\n".join(map(str, self.findings))
-
-    __repr__ = __str__
-
-    @property
-    def failures(self) -> tuple[Finding, ...]:
-        """The finding of a limit that is not met, if any."""
-        return tuple(f for f in self.findings if f.severity is Severity.FAILURE)
 
 
 def bound_errors(

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from loopcal.findings import Finding, Severity
 from loopcal.results.description import Field, Records, Source, collect_records
 from loopcal.results.presenters import draw, find_presenter
 from loopcal.results.serialization import json_fields
@@ -28,6 +29,12 @@ class Result:
     FIELDS: ClassVar[tuple[Field, ...]] = ()
     """What the result states. Without fields for JSON, JSON has the fields of the dataclass."""
 
+    @property
+    def failures(self) -> tuple[Finding, ...]:
+        """Findings by which the result is not good enough, such as limits that are exceeded."""
+        findings: tuple[Finding, ...] = getattr(self, "findings", ())
+        return tuple(f for f in findings if f.severity is Severity.FAILURE)
+
     def to_dict(self) -> dict[str, Any]:
         """Return the content by name for JSON, SI."""
         return json_fields(self)
@@ -42,6 +49,9 @@ class Result:
 
         own_page = find_presenter("page", type(self))
         return repr(self) if own_page is None else render_text(own_page(self), UNBROKEN)
+
+    def __repr__(self) -> str:  # of dataclasses with `repr=False`, which have a text or a page
+        return str(self)
 
     def _repr_html_(self) -> str:
         """Return the result as HTML, with at most some 30 rows of each table."""
