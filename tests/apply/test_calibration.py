@@ -87,7 +87,7 @@ def test_good_calibration_reaches_the_noise_floor_and_has_a_next_step(report):
     validation = report.validation
     assert validation is not None
     for quantity in ("position", "orientation"):
-        floor = getattr(validation.noise_floor, quantity)
+        floor = validation.noise_floor.rms[quantity]
         assert 0.7 * floor < validation.after.statistics(quantity).rms < 2.0 * floor
     assert report.robot is report.identification.robot
     assert report.fitted_errors is None

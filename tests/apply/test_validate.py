@@ -199,8 +199,8 @@ def test_exceeded_limit_fails_with_quantity_and_limit(split_data):
     (failure,) = failed.failures
     assert failure.code == "conformity.fails"
     assert failure.data["quantity"] == "position"
-    assert failure.data["limit"].value == pytest.approx(1e-4)
-    assert failure.data["limit"].unit == "mm"
+    assert failure.data["limit"].value == pytest.approx(0.1)
+    assert failure.data["limit"].unit == "um"
 
 
 def test_limit_on_an_unmeasured_quantity_fails():

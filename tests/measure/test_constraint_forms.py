@@ -90,7 +90,7 @@ def compare_covariances(layout: Layout) -> float:
 
 def solve_exact_readings(layout: Layout) -> np.ndarray:
     """Return readings (1, n, 6) at which the nominal machine touches its surfaces."""
-    return layout.solve_readings(layout.robot.parameters.nominal[None], 0.0, 0)
+    return layout.hold_points(layout.robot.parameters.nominal[None])[1]
 
 
 def test_plane_and_line_on_the_same_surface_share_its_direction(layout) -> None:
@@ -183,7 +183,8 @@ def test_both_forms_give_the_same_estimate_to_first_order(layout, method) -> Non
     truth = sample_truth(layout.robot, 1, 3)
     unlike = []
     for noise in (NOISE, 10.0 * NOISE):
-        q = layout.solve_readings(truth, noise, 3)
+        drawn = np.random.default_rng(3).normal(scale=noise, size=(1, layout.points, 3))
+        q = layout.hold_points(truth, drawn)[1]
         problem = PaperRows(layout, q, MM, noise)
         paper = problem.values(identify_from_rows(problem, method, 1e-6).deviation)[0]
         found = identify(

@@ -29,7 +29,6 @@ from loopcal.studies.files.store import (
     NAME,
     StudySource,
     StudyStore,
-    extend_study,
     merge_studies,
     open_store,
     open_study,
@@ -110,9 +109,8 @@ def test_folder_is_continued_extended_and_equal_to_one_made_at_once(undisturbed,
     file = write_study(tmp_path, replicates=10)
     first = loopcal.study(file, tmp_path / "study")
     assert first.summarize().trials == CELLS * 10
-    with extend_study(tmp_path / "study", 20) as store:
-        study = read_study(tmp_path / "study")
-        report = run_blocks(study, store, Serial())
+    more = StudySource(replace(read_study(tmp_path / "study"), replicates=20))
+    report = run_study(more, tmp_path / "study", Serial(), resume=True)
     assert (report.total, report.before, report.computed, report.trials) == (16, 8, 8, 40)
     assert read_contents(tmp_path / "study") == read_contents(undisturbed)
 

@@ -17,6 +17,7 @@ import itertools
 import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property, partial
 from itertools import pairwise
@@ -507,52 +508,49 @@ def export_trials(
     ending = path.suffix.lower()
     if ending not in (".csv", ".parquet"):
         raise DataError(f"{path} must end in .csv or .parquet, which decides its format")
-    write = _write_csv if ending == ".csv" else _write_parquet
-    with replace_file(path) as temporary, store.keep_state():
-        return write(study, store, temporary, progress)
-
-
-def _write_csv(study: Study, store: StudyStore, path: Path, progress: Progress) -> int:
-    names, count = tuple(study.levels), 0
-    units = [f" [{c.unit}]" if c.unit != "1" else "" for c in study.columns]
-    titles = [f"{c.name}{unit}" for c, unit in zip(study.columns, units, strict=True)]
-    with path.open("w", encoding="utf-8", newline="") as stream:
-        writer = csv.writer(stream, lineterminator="\n")
-        writer.writerow([*names, "trial", *titles])
+    begin, count = _begin_csv if ending == ".csv" else _begin_parquet, 0
+    with replace_file(path) as temporary, store.keep_state(), begin(study, temporary) as write:
         for cell in study.cells:
             progress(cell.number, len(study.cells), "writing trials")
-            levels = [cell.levels[name] for name in names]
-            for first, scores in iterate_trials(study, store, cell):
-                for i, row in enumerate(scores.tolist()):
-                    numbers = [value if math.isfinite(value) else "" for value in row]
-                    writer.writerow([*levels, first + i, *numbers])
-                count += len(scores)
-    return count
-
-
-def _write_parquet(study: Study, store: StudyStore, path: Path, progress: Progress) -> int:
-    arrow = import_optional("pyarrow", "tables", StudyError)
-    parquet = import_optional("pyarrow.parquet", "tables", StudyError)
-    names, count = tuple(study.levels), 0
-    word = arrow.dictionary(arrow.int32(), arrow.string())
-    fields = [arrow.field(name, word) for name in names]
-    fields.append(arrow.field("trial", arrow.int64()))
-    fields += [
-        arrow.field(column.name, arrow.float64(), metadata={"unit": column.unit})
-        for column in study.columns
-    ]
-    schema = arrow.schema(fields)
-    with parquet.ParquetWriter(path, schema) as writer:
-        for cell in study.cells:
-            progress(cell.number, len(study.cells), "writing trials")
-            if not (parts := list(iterate_trials(study, store, cell))):
-                continue
-            trials = np.concatenate([first + np.arange(len(scores)) for first, scores in parts])
-            scores = np.concatenate([scores for _, scores in parts])
-            levels = ([cell.levels[name]] * len(trials) for name in names)
-            writer.write_table(arrow.table([*levels, trials, *scores.T], schema=schema))
+            trials, scores = read_trials(study, store, cell)
+            if len(trials):
+                write(list(cell.levels.values()), trials, scores)
             count += len(trials)
     return count
+
+
+WriteTrials = Callable[[list[str], np.ndarray, FloatArray], None]
+"""Write trials (t,) and scores (t, s) of a cell with these levels, in the order of the study."""
+
+
+@contextmanager
+def _begin_csv(study: Study, path: Path) -> Iterator[WriteTrials]:
+    titles = [f"{c.name} [{c.unit}]" if c.unit != "1" else c.name for c in study.columns]
+    with path.open("w", encoding="utf-8", newline="") as stream:
+        writer = csv.writer(stream, lineterminator="\n")
+        writer.writerow([*study.levels, "trial", *titles])
+
+        def write(levels: list[str], trials: np.ndarray, scores: FloatArray) -> None:
+            for trial, row in zip(trials, scores, strict=True):
+                numbers = [value if math.isfinite(value) else "" for value in row.tolist()]
+                writer.writerow([*levels, trial, *numbers])
+
+        yield write
+
+
+@contextmanager
+def _begin_parquet(study: Study, path: Path) -> Iterator[WriteTrials]:
+    arrow = import_optional("pyarrow", "tables", StudyError)
+    parquet = import_optional("pyarrow.parquet", "tables", StudyError)
+    word, number = arrow.dictionary(arrow.int32(), arrow.string()), arrow.float64()
+    fields = [arrow.field(name, word) for name in study.levels]
+    fields.append(arrow.field("trial", arrow.int64()))
+    fields += [arrow.field(c.name, number, metadata={"unit": c.unit}) for c in study.columns]
+    schema = arrow.schema(fields)
+    with parquet.ParquetWriter(path, schema) as writer:
+        yield lambda levels, trials, scores: writer.write_table(
+            arrow.table([*([x] * len(trials) for x in levels), trials, *scores.T], schema=schema)
+        )
 
 
 # Questions and their answers.

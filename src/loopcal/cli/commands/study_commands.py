@@ -10,6 +10,7 @@ import re
 import sys
 import textwrap
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -238,10 +239,11 @@ def extend(
     Examples:
       loopcal study extend results --replicates 5000
     """
-    from loopcal.studies.files.store import extend_study, load_specification
+    from loopcal.studies.files.store import StudySource, open_study, read_study
 
-    with extend_study(folder, replicates) as store:
-        return run_and_report(load_specification(store), store, folder, work)
+    source = StudySource(replace(read_study(folder), replicates=replicates))
+    with open_study(folder, source, resume=True) as store:
+        return run_and_report(source.study, store, folder, work)
 
 
 @opt.command(of=study)

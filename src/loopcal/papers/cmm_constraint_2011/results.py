@@ -298,7 +298,7 @@ def compute_frame_effect(study: Study) -> float:
     machine is moved by a meter and turned by a radian about each axis.
     """
     robot, layout = study.robot, study.layout
-    q = layout.solve_readings(sample_truth(robot, 1, study.grid.seed), 0.0, 0)
+    q = layout.hold_points(sample_truth(robot, 1, study.grid.seed))[1]
     points, J, _ = layout.linearize_points(robot.parameters.nominal[None], q)
     R = geometry.exp_so3(np.ones(3))
     first, moved = linearize_products(points, J), linearize_products(points @ R.T + 1.0, R @ J)

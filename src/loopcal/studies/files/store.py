@@ -537,19 +537,6 @@ def open_study(folder: Path, source: StudySource, resume: bool = False) -> Itera
                 folder.mkdir(exist_ok=True)
 
 
-@contextmanager
-def extend_study(folder: Path, replicates: int | None = None) -> Iterator[StudyStore]:
-    """Open the folder of a study as its driver, with more replicates where these are given.
-
-    Raises FileError: fewer replicates than before; or see `open_store`.
-    """
-    study = read_study(folder)
-    if replicates is not None:
-        study = replace(study, replicates=replicates)
-    with open_study(folder, StudySource(study), resume=True) as store:
-        yield store
-
-
 def read_study(folder: Path) -> Study:
     """Return the study of a folder."""
     with read_store(folder) as store:

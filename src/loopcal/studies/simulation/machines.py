@@ -182,7 +182,7 @@ def measure_held_points(
     n = layout.points
     assigned = Instrument(tuple(sensor.assign_rows(n) for sensor in instrument.sensors))
     (noise,) = {id(s.noise): s.noise for s in assigned.sensors if s.kind.name == "plane"}.values()
-    drawn = np.zeros((len(truth), n, 3))
+    drawn: FloatArray | float = 0.0
     if not is_exact:
         streams = (make_random_stream(seed, trial) for trial in range(len(truth)))
         drawn = np.stack([noise.draw(stream, 3 * n).reshape(n, 3) for stream in streams])

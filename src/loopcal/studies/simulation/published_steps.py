@@ -50,7 +50,7 @@ from loopcal.estimate.penalties import LeastSquares, Method
 from loopcal.estimate.problem import Problem, problem_of_trials
 from loopcal.findings import report_finding
 from loopcal.findings.wording import name_count
-from loopcal.measure.instrument import Gaussian, make_random_stream
+from loopcal.measure.instrument import Gaussian
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations
 from loopcal.measure.simulation import Trials
@@ -567,7 +567,9 @@ class Layout:
         points = (self.state.T[0] @ self.robot.tool)[:, :3, 3]
         return compute_levers(points.reshape(self.groups, -1, 3))
 
-    def hold_points(self, truth: FloatArray, noise: FloatArray) -> tuple[State, FloatArray]:
+    def hold_points(
+        self, truth: FloatArray, noise: FloatArray | float = 0.0
+    ) -> tuple[State, FloatArray]:
         """Return states (t, n) and readings (t, n, a) of true machines (t, p) [SI] whose end point
         is held where it was commanded to, but for noise (t, n, 3) [m].
         """
@@ -575,22 +577,6 @@ class Layout:
         target[:, :, [self.robot.controlled.index(name) for name in POSITION]] += noise
         state = inverse_trials(self.robot, truth, target, self.state)
         return state, compute_readings(self.robot, truth, state)
-
-    def solve_readings(self, truth: FloatArray, sigma: float, seed: int) -> FloatArray:
-        """Return readings (t, n, a) at which true machines (t, p) [SI] hold the coordinates of the
-        measuring machine.
-
-        The true end point stands where it was commanded to, but for Gaussian noise of `sigma` [m]
-        in x, y and z. Trial i draws the same numbers whatever sigma and however many trials there
-        are.
-        """
-        noise = np.stack(
-            [
-                make_random_stream(seed, trial).standard_normal((self.points, 3))
-                for trial in range(len(truth))
-            ]
-        )
-        return self.hold_points(truth, sigma * noise)[1]
 
     def linearize_points(
         self, values: FloatArray, q: FloatArray
