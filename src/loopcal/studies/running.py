@@ -28,7 +28,7 @@ from loopcal.io.core.outputs import FolderKind, refuse_folder, write_result_fold
 from loopcal.io.core.text_file import as_path
 from loopcal.io.data.measurement_file import format_measurements
 from loopcal.io.robot.robot_file import format_robot
-from loopcal.io.runs.run_folder import build_document, refuse_run_folder, save_run
+from loopcal.io.runs.run_folder import RUN, build_document, save_run
 from loopcal.results.tables import Block
 from loopcal.studies.executors import MOST_LOSSES, Executor, Processes, Serial
 from loopcal.studies.files.store import StudySource, StudyStore, open_study, read_study
@@ -443,7 +443,7 @@ def calibrate_trial(
         limit_position=limits.limit_position,
         limit_angle=limits.limit_angle,
     )
-    refuse_run_folder(output, force)
+    refuse_folder(output, RUN, force)
     place = output.with_name(f"{output.name}-input")
     refuse_folder(place, INPUTS, force)
     contents = {

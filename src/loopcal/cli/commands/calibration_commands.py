@@ -93,14 +93,10 @@ def calibrate(
       loopcal calibrate hexapod-42 after-repair.csv -o run2 --prior run --free-limb leg3
       loopcal calibrate robot.yaml samples.csv -o run --compare published.yaml
     """
+    from loopcal.io.core.outputs import refuse_folder
     from loopcal.io.data.measurement_file import list_measurement_files
     from loopcal.io.robot.robot_file import find_robot_file
-    from loopcal.io.runs.run_folder import (
-        RESULT,
-        build_document,
-        name_robot_file,
-        refuse_run_folder,
-    )
+    from loopcal.io.runs.run_folder import RESULT, RUN, build_document, name_robot_file
     from loopcal.report.calibration_view import view_calibration
 
     inputs = {"robot": find_robot_file(robot), **list_measurement_files(data)}
@@ -127,7 +123,7 @@ def calibrate(
         allow_duplicates=allowed["allow_duplicates"],
     )
     if output is not None:
-        refuse_run_folder(output, force, list(inputs.values()))
+        refuse_folder(output, RUN, force, list(inputs.values()))
     measurements = opt.read_measurements(data, machine, **allowed)
     with terminal.TerminalProgress() as progress:
         report = lc.calibrate(machine, measurements, settings, progress)

@@ -100,7 +100,7 @@ def _is_same_file(path: Path, other: Path) -> bool:
 
 @contextmanager
 def replace_folder(
-    path: Path, check: Callable[[Path], None] | None = None, names: Collection[str] = ()
+    path: Path, check: Callable[[Path], object] = lambda _: None, names: Collection[str] = ()
 ) -> Iterator[Path]:
     """Yield a temporary folder that takes the place of `path` where the body succeeds.
 

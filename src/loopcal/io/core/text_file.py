@@ -148,7 +148,7 @@ def create_temporary(target: Path, is_folder: bool = False) -> Iterator[Path]:
 
 
 def place_folder(
-    temporary: Path, target: Path, path: Path, check: Callable[[Path], None] | None = None
+    temporary: Path, target: Path, path: Path, check: Callable[[Path], object]
 ) -> None:
     """Give a complete folder its name, and remove the folder that had it.
 
@@ -164,17 +164,14 @@ def place_folder(
         with _lock_folder(target) as is_locked:
             if not is_locked:  # another program has replaced or removed the old folder
                 continue
-            if check is not None:
-                check(target)
+            check(target)
             if not _exchange(temporary, target):
                 continue
             try:
-                if check is not None:
-                    check(temporary)
+                check(temporary)
             except BaseException:  # it was changed in the last moment, and gets its name again
                 _exchange(temporary, target)
-                if check is not None:
-                    check(target)  # names the folder as the user does
+                check(target)  # names the folder as the user does
                 raise
             sync_folder(target.parent)
             _remove(temporary)

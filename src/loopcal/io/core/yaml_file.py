@@ -44,20 +44,18 @@ class YamlFile:
     """A mapping read from a YAML file.
 
     `content` is plain: dicts, lists, text, finite numbers, booleans and None; `lines` are those of
-    its keys and items, from 0. The YAML text begins at `first_line`, which is later than 1 for
-    front matter.
+    its keys and items, from 0.
     """
 
     path: Path
     text: str
     content: dict[str, Any]
     lines: Mapping[Location, int] = field(default_factory=dict)
-    first_line: int = 1
 
     def line(self, location: Location) -> int:
         """Return the line of the node at `location`; steps that do not exist are ignored."""
         known = (location[:n] for n in range(len(location), 0, -1) if location[:n] in self.lines)
-        return self.lines.get(next(known, ()), 0) + self.first_line
+        return self.lines.get(next(known, ()), 0) + 1
 
     def error(self, sentence: Any, location: Location = ()) -> FileError:
         """Return an error at the line of `location`, or without a line where it does not exist."""
@@ -84,14 +82,12 @@ def read_yaml(path: str | Path, what: str, has_names: bool = True) -> YamlFile:
     return parse_yaml(read_text(path, what, limit=YAML_SIZE), path, what, has_names=has_names)
 
 
-def parse_yaml(
-    text: str, path: str | Path, what: str, first_line: int = 1, has_names: bool = True
-) -> YamlFile:
-    """Parse YAML text that begins at line `first_line` of `path`; raise as `read_yaml`."""
+def parse_yaml(text: str, path: str | Path, what: str, has_names: bool = True) -> YamlFile:
+    """Parse YAML text of `path`; raise as `read_yaml`."""
     path = as_path(path, what)
     YAML_SIZE.check(len(text), what, path)
     try:
-        content, lines = _load_content(text, path, what, first_line, has_names)
+        content, lines = _load_content(text, path, what, has_names)
     except FileError as error:
         is_ours = not has_names or _KNOWN_KEY.search(text) is not None
         if is_ours or error.code == "files.limit-exceeded":  # which only has numbers
@@ -101,30 +97,30 @@ def parse_yaml(
     if not isinstance(content, dict):
         sentence = f"this {what} contains no 'key: value' lines. See the examples of loopcal"
         raise FileError(sentence, path)
-    return YamlFile(path, text, content, lines, first_line)
+    return YamlFile(path, text, content, lines)
 
 
 def _load_content(
-    text: str, path: Path, what: str, first_line: int, has_names: bool
+    text: str, path: Path, what: str, has_names: bool
 ) -> tuple[Any, Mapping[Location, int]]:
     """Return the content of a text, and the lines in it; raise FileError for bad syntax."""
     from ruamel.yaml.error import MarkedYAMLError, YAMLError
 
     if (directive := _DIRECTIVE.match(text)) is not None:
         sentence = "this file must not have YAML directives, which begin with %. Remove the line"
-        raise FileError(sentence, path, directive[0].count("\n") + first_line)
+        raise FileError(sentence, path, directive[0].count("\n") + 1)
     try:
         compose = _compose if len(text) <= KEPT_LENGTH else _compose.__wrapped__
         reader = _NodeReader(has_names)
         return reader.read(compose(text), (), 0), reader.lines
     except _RefusedError as error:
-        line = error.line + first_line
+        line = error.line + 1
         if isinstance(error.refusal, FileLimit):
             raise error.refusal.make_error(what, path, line=line) from None
         raise FileError(error.refusal, path, line) from None
     except MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
-        line = mark.line + first_line if mark else None
+        line = mark.line + 1 if mark else None
         if "max_depth" in str(error.problem):
             raise YAML_DEPTH.make_error(what, path, line=line) from None
         problem = _shorten(error.problem or error.context or "not YAML")

@@ -23,7 +23,7 @@ import re
 import struct
 import tokenize
 import zipfile
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import astuple, dataclass, field, make_dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -45,7 +45,6 @@ from loopcal.io.core.outputs import (
     FolderKind,
     describe_leftover,
     list_changed_files,
-    refuse_folder,
     write_result_folder,
 )
 from loopcal.io.core.records import read_record
@@ -229,9 +228,7 @@ FAULTS = (
 END = struct.Struct("<4s4H2LH")
 
 
-def read_arrays(
-    path: Path, size: FileLimit = ARRAYS_SIZE, count: FileLimit = ARRAYS_COUNT
-) -> dict[str, np.ndarray]:
+def read_arrays(path: Path, size: FileLimit = ARRAYS_SIZE) -> dict[str, np.ndarray]:
     """Return name -> array, read-only, of a file that `numpy.savez` wrote.
 
     FileError : not an ordinary file, not readable, or beyond a limit. ValueError : damaged.
@@ -245,12 +242,12 @@ def read_arrays(
         signature, *counts = END.unpack(stream.read(END.size))
         if signature != b"PK\5\6":
             raise ValueError("it is not an archive, or its end is missing")
-        count.check(int(counts[3]), WHAT, path)
+        ARRAYS_COUNT.check(int(counts[3]), WHAT, path)
         stream.seek(0)
         try:
             with zipfile.ZipFile(stream) as archive:
                 members = archive.infolist()
-                count.check(len(members), WHAT, path)
+                ARRAYS_COUNT.check(len(members), WHAT, path)
                 size.check(sum(member.file_size for member in members), WHAT, path)
                 return {
                     member.filename.removesuffix(".npy"): _read_member(archive, member)
@@ -621,11 +618,6 @@ def collect_provenance(
     return made_by | {"seeds": dict(seeds), "inputs": files}
 
 
-def refuse_run_folder(path: str | Path, force: bool, inputs: Sequence[Path] = ()) -> None:
-    """Raise FileError where a run must not be written; see `refuse_folder`."""
-    refuse_folder(as_path(path, "run folder"), RUN, force, inputs)
-
-
 def write_run_folder(
     path: str | Path,
     result: Mapping[str, Any],
@@ -640,11 +632,10 @@ def write_run_folder(
     FAILED_ROBOT.
     """
     path = as_path(path, "run folder")
-
-    def write_arrays(file: Path) -> None:
-        np.savez(file, allow_pickle=False, **arrays)
-
-    files = {robot_name: robot_text.encode(), ARRAYS: write_arrays}
+    files: dict[str, bytes | Callable[[Path], object]] = {
+        robot_name: robot_text.encode(),
+        ARRAYS: lambda file: np.savez(file, allow_pickle=False, **arrays),
+    }
     write_result_folder(path, RUN, result, files, force)
     return path
 
