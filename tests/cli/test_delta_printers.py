@@ -103,7 +103,7 @@ def test_factory_default_is_reported_as_not_calibrated(loopcal, calibrate) -> No
     # default does not
     loopcal(
         "validate robot.yaml heights.csv --limit-position 0.1mm",
-        "(rejection from 0.139 mm). The largest measured error is 0.262 mm, at",
+        "(rejection from 139 um). The largest measured error is 262 um, at",
         code=2,
     )
     loopcal("validate run/robot.yaml heights.csv --limit-position 0.1mm")

@@ -54,6 +54,7 @@ def test_lost_exceptions_of_other_kinds_are_reported(monkeypatch) -> None:
 
 STOPPED = """
 import signal, sys
+signal.signal(signal.SIGHUP, signal.SIG_DFL)  # nohup ignores it, and so does what nohup runs
 from loopcal.__main__ import run
 from loopcal.cli import entry_point
 entry_point.command_line.main = lambda *_, **__: signal.raise_signal(signal.{name})

@@ -29,8 +29,10 @@ def test_page_runs_as_printed(root, tmp_path, monkeypatch, capsys) -> None:
     assert said == printed[0]
     assert [main(command.split()[1:]) for command in commands[1].splitlines()] == [0, 0]
     assert '<div class="blank"><dt>customer</dt>' in Path("signed.html").read_text("utf-8")
+    assert [main(command.split()[1:]) for command in commands[2].splitlines()] == [0]
+    assert "radius" in Path("volume.html").read_text("utf-8")
     capsys.readouterr()
-    assert [main(command.split()[1:]) for command in commands[2].splitlines()] == [0, 0]
+    assert [main(command.split()[1:]) for command in commands[3].splitlines()] == [0, 0]
     assert capsys.readouterr().out == printed[1]
     exec(code[0], {})  # noqa: S102
     assert Path("again.html").read_text("utf-8") == Path("may.html").read_text("utf-8")

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from numbers import Integral
 from typing import ClassVar, NamedTuple, Protocol, Self
 
@@ -385,7 +385,11 @@ def descend(
         first = way[0] if way else _linearize(problem, z, begin)
     arrival = np.full(len(z), way[1].change if way else np.inf) if arrival is None else arrival
     taken = len(way[1].costs) - 1 if way else 0
-    at_start = partial(_linearize, problem, z, begin) if taken else lambda: first
+
+    def model_start() -> LinearModel:
+        return make_linear_model(_linearize(problem, z, begin), method, tolerance, fixed)
+
+    at_start = model_start if taken else None
     at = first, arrival, taken, at_start
     run = _Run(problem, method, fixed, tolerance, control, sufficient, *at)
     if may_be_weak:
@@ -508,7 +512,7 @@ class _Run:
         first: Linearization,
         arrival: FloatArray,
         taken: int,
-        at_start: Callable[[], Linearization],
+        at_start: Callable[[], LinearModel] | None,
     ) -> None:
         self.problem, self.method, self.fixed, self.tolerance = problem, method, fixed, tolerance
         self.control, self.sufficient = control, sufficient
@@ -517,9 +521,8 @@ class _Run:
         self.status = np.where(np.isfinite(self.point.cost), running, bad).astype(int)
         self.taken = np.full(t, taken)
         self.chains = _FullSteps(self.point, taken)
-        self.damping = _Damping(
-            t, control.damping, lambda: self.locate(at_start(), arrival).linear_model
-        )
+        model = self.point.linear_model  # without the rows of the start, and without this run
+        self.damping = _Damping(t, control.damping, at_start or (lambda: model))
         self.marks = np.full((t, 3), np.inf)  # of the last progress, and evaluations since then
         self.age = np.zeros(t, dtype=np.int64)
 
