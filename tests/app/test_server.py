@@ -16,7 +16,7 @@ import pytest
 
 from loopcal.app.project import Project, clean_name, recognize
 from loopcal.cli.entry_point import main
-from loopcal.errors import DataError
+from loopcal.errors import DataError, FileError
 from loopcal.findings import report_finding
 from tests.app.conftest import EXAMPLE
 from tests.io.test_probe_reports import MARLIN, REPRAP
@@ -43,6 +43,9 @@ NAMES = {
     "C:\\Users\\x\\h\u00f6hen.csv": "h\u00f6hen.csv",
     'a"; filename="b.csv': "b.csv",
     "x" * 300 + ".csv": ".csv",
+    "\U0001f600" * 80 + ".csv": ".csv",
+    "\u202e" * 70 + "x": "x.txt",
+    "-=x.csv": "x.csv",
 }
 
 
@@ -54,7 +57,8 @@ def test_a_name_of_a_client_becomes_a_name_inside_the_folder(name: str, tmp_path
     assert Path(safe).suffix
     assert not safe.startswith(("-", "."))
     assert not set(safe) & set('/\\"\0\n:<>|?*')
-    assert len(safe.encode()) < 255
+    assert len(safe.encode()) < 255 - len("result.yaml")
+    assert clean_name(safe) == safe  # as when a kept folder is read
 
 
 @pytest.mark.parametrize("name", ["", "..", "///", "...", "- -"])
@@ -293,6 +297,47 @@ def test_a_folder_with_other_content_is_refused_and_kept(tmp_path, capsys) -> No
     assert word("session.other-content") in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["result"]
     assert file.read_text() == "mine"
+
+
+CHOICES = [
+    {"foo": 1},
+    [],
+    7,
+    {"kinds": []},
+    {"kinds": {"a.csv": 1}},
+    {"kinds": {"a.csv": "wrong"}},
+    {"kinds": {"": "data"}},
+    {"kinds": {"../secret.txt": "data"}},
+    {"kinds": {"/etc/passwd": "data"}},
+    {"kinds": {"choices": "data"}},
+    {"dropped": [1]},
+    {"runs": "1"},
+    {"runs": True},
+    {"is_measured": 1},
+    {"codes": {"plan": True}},
+    {"settings": None},
+]
+
+
+@pytest.mark.parametrize("choices", CHOICES, ids=str)
+def test_choices_that_loopcal_did_not_write_are_refused(choices: object, tmp_path) -> None:
+    (tmp_path / "choices").write_text(json.dumps(choices))
+    with pytest.raises(FileError) as caught:
+        Project(tmp_path)
+    assert caught.value.code == "app.choices"
+
+
+@pytest.mark.parametrize("name", ["a.csv", "choices", "result/files", "session"])
+def test_a_kept_folder_with_links_is_refused(name: str, tmp_path) -> None:
+    folder = tmp_path / "kept"
+    (folder / name).parent.mkdir(parents=True)
+    (tmp_path / "elsewhere").write_text('{"kinds": {"a.csv": "data"}}')
+    (folder / "choices").write_text('{"kinds": {"a.csv": "data"}}')
+    (folder / name).unlink(missing_ok=True)
+    (folder / name).symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(FileError) as caught:
+        Project(folder)
+    assert caught.value.code == "app.choices"
 
 
 @pytest.mark.slow

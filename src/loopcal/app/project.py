@@ -17,11 +17,12 @@ import os
 import re
 import shutil
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import asdict, dataclass, field, replace
+from inspect import signature
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args, get_origin, get_type_hints
 
 import psutil
 
@@ -38,7 +39,7 @@ from loopcal.results.notebook import render_html
 from loopcal.results.tables import Block, Table, choose_unit, format_in
 from loopcal.units import DISPLAY_UNITS
 
-LONGEST = 80  # characters of the name of a file
+LONGEST = 200  # bytes of the name of a file
 HEAD = 200_000  # characters by which a file is recognized
 STATE, REPORT = "choices", "result/files/report.html"
 RUN, SESSION, SHEET = "result/run", "session/measurements.csv", "plan/measurements.csv"
@@ -58,11 +59,34 @@ def clean_name(name: str) -> str:
     """Return a name of a client as that of a file: without folders and characters with a meaning,
     not hidden, no option, and with an ending, which folders do not have.
     """
-    last = re.split(r"[/\\]", make_name(name[-LONGEST:]))[-1]
+    cut = name.encode(errors="ignore")[-LONGEST:].decode(errors="ignore")
+    last = re.split(r"[/\\]", make_name(cut))[-1]
     safe = re.sub(r'[<>:"|?*]', "_", last).lstrip(".- ").rstrip(". ")
     if not safe:
         raise DataError(report_finding("app.unnamed"))
-    return safe if Path(safe).suffix else f"{safe}.txt"
+    safe = safe if Path(safe).suffix else f"{safe}.txt"
+    return safe if safe == name else clean_name(safe)
+
+
+def fits(value: Any, hint: Any) -> bool:
+    """Return whether a value of JSON has a type."""
+    kind, parts = get_origin(hint) or hint, []
+    if isinstance(value, dict | list):
+        parts = list(value.values() if isinstance(value, dict) else value)
+    is_kind = isinstance(value, kind) and (kind in (bool, str)) == isinstance(value, bool | str)
+    return is_kind and all(fits(part, get_args(hint)[-1]) for part in parts)
+
+
+def check_facts(maker: Callable[..., Any], facts: Any) -> dict[str, Any]:
+    """Return what a client or a file says, if it is the arguments of `maker`; else DataError."""
+    hints, facts = get_type_hints(maker), facts if isinstance(facts, dict) else {"": facts}
+    try:
+        signature(maker).bind(**facts)
+    except TypeError:
+        facts = {"": None}
+    if not all(key in hints and fits(value, hints[key]) for key, value in facts.items()):
+        raise DataError(report_finding("app.wrong"))
+    return facts
 
 
 def recognize(path: Path) -> str:
@@ -105,7 +129,14 @@ class Project:
         if any(folder.iterdir()) and not self.has(STATE):
             raise FileError(report_finding("session.other-content"), folder)
         known = read_json(folder / STATE, "choices", "remove it") if self.has(STATE) else {}
-        self.chosen = Choices(**known)
+        try:
+            self.chosen = Choices(**check_facts(Choices, known))
+            kinds = self.chosen.kinds.items()
+            is_ours = all(clean_name(n) == n and k in (*KINDS, *FORMATS) for n, k in kinds)
+        except DataError:
+            is_ours = False
+        if not is_ours or any(path.is_symlink() for path in folder.rglob("*")):
+            raise FileError(report_finding("app.choices"), folder / STATE)
         self.store()
         self.progress: tuple[str, int, int] | None = None
         self.work: asyncio.Task[None] | None = None
