@@ -17,7 +17,6 @@ from loopcal.findings import IMPORTANCE, report_finding, sort_by_importance
 from loopcal.findings.catalog import load_catalog
 from loopcal.findings.catalog.phrases import MACHINE
 from loopcal.findings.wording import add_advice
-from loopcal.report.calibration_view import no_hint
 from tools.fuzz.commands import list_commands
 
 WORK = """
@@ -66,7 +65,7 @@ def test_change_of_a_freed_limb_has_no_hint_to_free_it():
 def test_hint_follows_its_finding():
     finding = report_finding("workflow.no-held-out-poses")
     assert add_advice(finding, hint_for(finding)).endswith(" (Hint: use --hold-out 0.25)")
-    assert add_advice(finding, no_hint(finding)) == str(finding)
+    assert add_advice(finding, None) == str(finding)
 
 
 def test_findings_are_sorted_from_failure_to_info():

@@ -14,7 +14,7 @@ from loopcal.diagnose.fit_examination import ROUNDING
 from loopcal.diagnose.row_errors import METRICS, SUMMARY
 from loopcal.estimate.result import LAST_DIGITS, Identification
 from loopcal.findings import Finding, Severity, report_finding
-from loopcal.findings.wording import add_advice, count_decimals, list_names
+from loopcal.findings.wording import add_advice, count_decimals, list_names, name_count
 from loopcal.report.validation_view import describe_improvements, view_error_statistics, view_errors
 from loopcal.report.words import say
 from loopcal.results.description import Field
@@ -113,13 +113,9 @@ Hint = Callable[[Finding], str | None]
 """From a finding to advice of the caller, such as a command-line option."""
 
 
-def no_hint(_: Finding) -> None:
-    """Return no advice."""
-
-
 @register("page", "loopcal.apply.calibration_report:CalibrationReport")
 def view_calibration(
-    report: CalibrationReport, verbose: bool = False, hint: Hint = no_hint
+    report: CalibrationReport, verbose: bool = False, hint: Hint = lambda _: None
 ) -> list[Block]:
     """Return the page of a calibration.
 
@@ -145,7 +141,7 @@ def view_calibration(
     selected = report.findings if verbose else report.top_findings
     blocks += ["", *format_list([(f.severity.value, add_advice(f, hint(f))) for f in selected])]
     if more := len(report.findings) - len(selected):
-        blocks.append(f"  ({more} more finding{'' if more == 1 else 's'} in the full report)")
+        blocks.append(f"  ({name_count(more, 'more finding')} in the full report)")
     if fit.converged and not verbose and fit.regularization is not None:
         blocks.append(f"  {fit.regularization.finding}")
     if report.comparison is not None:

@@ -13,7 +13,7 @@ from loopcal.apply.repeatability import DIMENSIONS, Repeatability
 from loopcal.apply.validation import FEW_ROWS, ErrorChange, Validation
 from loopcal.diagnose.row_errors import METRICS, SUMMARY
 from loopcal.findings import Finding, Severity, sort_by_importance
-from loopcal.findings.wording import list_names
+from loopcal.findings.wording import list_names, name_count
 from loopcal.report.words import say
 from loopcal.results.presenters import register
 from loopcal.results.tables import (
@@ -81,8 +81,7 @@ def view_errors(validation: Validation, what: str, with_before: bool = True) -> 
     what : of the rows, such as "held-out". with_before : whether there is a geometry before
         calibration to compare with.
     """
-    n = validation.judged
-    poses = f"{n} {what} {'pose' if n == 1 else 'poses'}"
+    poses = name_count(validation.judged, f"{what} pose")
     blocks: list[Block] = []
     divided = f"Errors at {poses}, divided by sigma"
     if validation.quantities:

@@ -105,16 +105,14 @@ def identifiability(
         subset = report.subset
         words = {merged.name: merged.describe_effect(most=3) for merged in subset.dropped}
         write_text(output, format_reduced_robot(subset.robot, words))
-    written = []
-    if output is not None:
-        written = ["", f"Written to {output}: the robot with the other parameters fixed"]
+    written = f"Written to {output}: the robot with the other parameters fixed"
     details = "the first combinations, suggested measurements, singular values and all parameters"
     page = [
         *drawn,
         *view_identifiability(report, verbose),
         *(list_hints(report.summary) if report.useful is None else ()),
         f"Hint: use {'--json for all combinations' if verbose else f'--verbose for {details}'}",
-        *written,
+        *([] if output is None else ["", written]),
     ]
     return Output(json_fields(report), lambda: page)
 
@@ -496,7 +494,6 @@ def board(
       loopcal board -o board.yaml
       loopcal board -o board.yaml --columns 12 --rows 8 --square 15mm --paper letter
     """
-    from loopcal.errors import DataError
     from loopcal.io.core.outputs import refuse_outputs, write_files
     from loopcal.io.pictures import (
         PAPERS,
@@ -578,21 +575,19 @@ def photos(
 
     from loopcal.cli.commands.study_commands import count_processors
     from loopcal.environment import import_optional
-    from loopcal.errors import DataError
     from loopcal.findings import report_finding
     from loopcal.io import pictures as of
     from loopcal.io.core.csv_table import refuse_settings_beside
     from loopcal.io.core.outputs import refuse_outputs, write_files
-    from loopcal.io.pictures import load_dictionary, read_board
     from loopcal.studies.executors import Processes, Serial
 
     if output.suffix != ".csv":
         raise DataError(f"{output} becomes a measurement file. Use a name that ends in .csv")
-    page_file, known = output.with_suffix(".html"), read_board(board)
+    page_file, known = output.with_suffix(".html"), of.read_board(board)
     paths = of.list_pictures(folder)
     refuse_outputs((output, page_file), (board, poses, *paths), force)
     refuse_settings_beside(output)
-    load_dictionary(import_optional("cv2", "camera"), known)
+    of.load_dictionary(import_optional("cv2", "camera"), known)
     if known.measured is None:
         terminal.print_finding("pictures.board-unmeasured")
     names, beside = of.name_poses(paths, poses), of.refer_to_poses(poses, output)

@@ -32,6 +32,7 @@ import regex
 from loopcal import geometry
 from loopcal.errors import FileError, suggest_names
 from loopcal.findings import Finding, report_finding
+from loopcal.findings.wording import name_count
 from loopcal.io.core.csv_table import (
     NAME_COLUMNS,
     Cells,
@@ -190,16 +191,14 @@ def check_count(line: Line, delimiter: str | None) -> None:
         reason = "one is missing, or a number or a name is split"
     else:
         return
-    raise Misfit(f"it has {_count_cells(count)}, but the header has {wanted} columns ({reason})")
+    raise Misfit(
+        f"it has {name_count(count, 'cell')}, but the header has {wanted} columns ({reason})"
+    )
 
 
 def _count(cells: Sequence[str], wanted: int) -> int:
     """Return the number of cells; one separator behind the wanted cells is not a cell."""
     return len(cells) - (len(cells) > wanted and not cells[-1])
-
-
-def _count_cells(count: int) -> str:
-    return f"{count} cell{'' if count == 1 else 's'}"
 
 
 def _decode(path: Path, profile: Profile, content: bytes | None) -> str:
@@ -249,7 +248,7 @@ def _join_rows(
     for line, row in lines:
         try:
             if line.header is None and (count := _count(line.cells, most)) != most:
-                raise Misfit(f"it has {_count_cells(count)}, but most lines have {most}")
+                raise Misfit(f"it has {name_count(count, 'cell')}, but most lines have {most}")
             shared, values = _split_row(row, profile)
             known = readings.get(row["pose"], {}) if values else {}
             for name, before in known.items():
@@ -534,14 +533,13 @@ def _to_quaternion(cells: Sequence[str]) -> Row:
 class FilledSheet:
     """A sheet with the points of an export.
 
-    text : the measurement file. table : its header and rows.
+    text : the measurement file.
     misfits : export, line and reason of lines that do not match the profile.
     data : the measurements, for checks before the file is written. unit : of the points.
     findings : what is filled in, missing, unknown or repeated.
     """
 
     text: str
-    table: tuple[tuple[str, ...], ...]
     misfits: tuple[tuple[str, int, str], ...]
     data: Measurements
     unit: str
@@ -608,21 +606,19 @@ def fill_sheet(
     data = read_rows(robot, table, body, header)
     source = " and ".join(map(str, exports))  # the file whose values a check doubts
     data = replace(data, observations=tuple(replace(o, source=source) for o in data.observations))
-    text, written = format_rows(table, body, header)
     unit = next((units.get(name) for name in columns if units.get(name)), None) or "mm"
-    return FilledSheet(text, written, tuple(misfits), data, unit, tuple(findings))
+    return FilledSheet(
+        format_rows(table, body, header), tuple(misfits), data, unit, tuple(findings)
+    )
 
 
-def format_rows(
-    table: Table, body: Sequence[Row], header: Mapping[str, str | None]
-) -> tuple[str, tuple[tuple[str, ...], ...]]:
-    """Return the measurement file of rows with the settings of a sheet: its text, and its cells."""
+def format_rows(table: Table, body: Sequence[Row], header: Mapping[str, str | None]) -> str:
+    """Return the text of the measurement file of rows with the settings of a sheet."""
     text = read_text(table.path, "sheet").lstrip("\ufeff")  # whose lines end as those of a table
     above = (line.rstrip("\r") for line in text.split("\n")[: table.header_line - 1])
     lines = [line for line in above if line.strip()]
-    cells = tuple(tuple(row.get(name, "") for name in header) for row in body)
-    written = (format_header(header), *cells)
-    return "\n".join([*lines, *map(format_row, written)]) + "\n", written
+    cells = ([row.get(name, "") for name in header] for row in body)
+    return "\n".join([*lines, *map(format_row, (format_header(header), *cells))]) + "\n"
 
 
 def read_sheet(path: Path, robot: Mechanism) -> tuple[Table, KindRows]:

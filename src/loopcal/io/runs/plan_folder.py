@@ -33,7 +33,7 @@ from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import POSITION, get_dimension
-from loopcal.units import Dimension, find_unit
+from loopcal.units import Dimension
 
 if TYPE_CHECKING:
     from loopcal.planning.plane_line_planning import SurfacePlan
@@ -108,10 +108,10 @@ def format_plan_data(plan: Plan) -> str:
 def format_poses(plan: Plan) -> str:
     """Return names, uses and readings of the poses, in the order of visiting."""
     count, poses = len(plan.robot.actuators), plan.poses
-    headers, factors = (of[-count:] for of in _list_columns(plan.robot))
+    headers, factors = _list_columns(plan.robot)
     rows = zip(poses.labels, poses.uses, poses.readings.tolist(), strict=True)
-    lines = [format_row(["pose", USE_COLUMN.name, *headers])]
-    lines += [format_row([name, use, *map(_format, q, factors)]) for name, use, q in rows]
+    lines = [format_row(["pose", USE_COLUMN.name, *headers[-count:]])]
+    lines += [format_row([name, use, *map(_format, q, factors[-count:])]) for name, use, q in rows]
     return "\n".join(lines) + "\n"
 
 
@@ -158,8 +158,7 @@ def _list_columns(robot: Mechanism) -> tuple[list[str], list[float]]:
         COMMANDED + name if name in readings else name: get_dimension(name)
         for name in robot.controlled
     }
-    dimensions |= readings
-    units = {name: find_unit(robot.units[dimension]) for name, dimension in dimensions.items()}
+    units = {name: robot.get_unit(of) for name, of in (dimensions | readings).items()}
     headers = [f"{name} [{unit.symbol}]" for name, unit in units.items()]
     return headers, [unit.factor_to_si for unit in units.values()]
 
@@ -172,7 +171,7 @@ def _format(value: float, factor: float) -> str:
 def format_surface_sheet(plan: SurfacePlan) -> str:
     """Return the operator's sheet: coordinates to hold, tolerance and command of each point."""
     robot = plan.robot
-    length = find_unit(robot.units[Dimension.LENGTH])
+    length = robot.get_unit(Dimension.LENGTH)
     columns, factors = _list_columns(robot)
     headers = ["step", "pose", "group", "role", "hold", f"tolerance [{length.symbol}]"]
     headers += [*(f"hold.{name} [{length.symbol}]" for name in POSITION), *columns]

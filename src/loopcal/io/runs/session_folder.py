@@ -204,7 +204,7 @@ def write_measurements(folder: Path, sheet: Table, visits: Sequence[Visit]) -> N
     """Write the used rows as the input of a calibration."""
     used = [visit for visit in visits if visit.is_used]
     if used:
-        write_text(folder / DATA, format_rows(sheet, *_list_rows(sheet, used))[0])
+        write_text(folder / DATA, format_rows(sheet, *_list_rows(sheet, used)))
     else:
         (folder / DATA).unlink(missing_ok=True)
 

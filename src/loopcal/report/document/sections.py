@@ -492,10 +492,9 @@ def describe_poses(record: CalibrationRecord) -> Iterator[Element]:
 
 def _list_labels(what: str, labels: Sequence[str]) -> str:
     """Return the labels in one sentence; of many the first; empty without any."""
-    count = len(labels)
-    noun = "pose" if count == 1 else "poses"
-    limit = f", here the first {MOST:,}" if count > MOST else ""
-    return f"{count:,} {what} {noun}{limit}: {', '.join(labels[:MOST])}." if labels else ""
+    count = f"{len(labels):,} {what} {'pose' if len(labels) == 1 else 'poses'}"
+    limit = f", here the first {MOST:,}" if len(labels) > MOST else ""
+    return f"{count}{limit}: {', '.join(labels[:MOST])}." if labels else ""
 
 
 def build_calibration_document(record: CalibrationRecord) -> Document:
