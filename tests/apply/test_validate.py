@@ -128,7 +128,7 @@ def test_errors_of_held_out_poses_are_at_the_noise_after_calibration(validation)
     assert validation.before.statistics("position").rms > 0.02 * MM
     # [m] sqrt(3) um of noise and as much of the fit
     assert validation.after.statistics("position").rms < 4e-6
-    assert validation.improvement() > 10.0
+    assert validation.changes()["position"].times > 10.0
 
 
 def test_commanded_errors_of_a_hexapod_equal_predicted_errors(validation):

@@ -117,7 +117,7 @@ FINDS = {
     "frame that no robot has": (
         "new gough -o new.yaml --frames position",
         {},
-        "loopcal: gough: 'position' is not a frame that can be unknown",
+        "loopcal: gough: an unknown frame is 'position'",
     ),
     "sheet without its names of poses": (
         "fill linear-delta s.csv e.txt --profile spatial-analyzer -o new.csv",

@@ -70,7 +70,7 @@ def test_json_contains_combinations_suggestions_reduction_and_indices(loopcal):
             "--measure is short for --kind component --components",
         ),
         ("3-prs --measure x,y,w", "the component 'w'"),
-        ("3-prs --frames floor", "'floor' is not a frame that can be unknown. Allowed: base, tool"),
+        ("3-prs --frames floor", "an unknown frame is 'floor', but must be one of 'base', 'tool'"),
         ("3-prs --kind inclination --frames base", "this kind of measurement has no base frame"),
         ("3-prs data.csv --measure x", "DATA defines the instrument"),
         ("3-prs -o smaller.yaml", "-o writes the robot of --reduce"),

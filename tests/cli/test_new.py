@@ -65,7 +65,7 @@ def test_filled_in_template_of_two_kinds_is_accepted(loopcal, tmp_path) -> None:
         ("hexpod", "neither a family nor a shipped robot"),
         ("gough --measurements d.csv --kind position,position", "'position' occurs twice"),
         ("gough --kind pose --targets SMR1", "the kind 'pose' measures no targets"),
-        ("gough --kind position --frames tracker", "'tracker' is not a frame that can be unknown"),
+        ("gough --kind position --frames tracker", "an unknown frame is 'tracker'"),
     ],
 )
 def test_wrong_words_are_refused_and_nothing_is_written(loopcal, folder, words, said) -> None:

@@ -67,12 +67,11 @@ def test_improvement_weights_each_instrument_by_its_sigma():
     )
     positions = Observations.from_sigma(Position().with_tool(new.tool), np.arange(10, 40), xyz, MM)
     result = validate(new, Measurements(new.name, readings, (heights, positions)), before=old)
-    assert result.improvement() == pytest.approx(
-        1 / np.sqrt(3.0), rel=1e-6
-    )  # as millimetres they grew
-    ((name, times),) = result.improvements().items()
+    before, after = (errors.statistics("position").rms for errors in (result.before, result.after))
+    assert before / after == pytest.approx(1 / np.sqrt(3.0), rel=1e-6)  # as millimetres they grew
+    ((name, change),) = result.changes().items()
     assert name == "weighted"
-    assert times == pytest.approx(np.sqrt(10 * 5.0**2 / (30 * 0.1**2)), rel=1e-6)
+    assert change.times == pytest.approx(np.sqrt(10 * 5.0**2 / (30 * 0.1**2)), rel=1e-6)
     assert [k.kind for k in result.to_dict()["kinds"]] == ["component", "position", "all"]
 
 

@@ -14,7 +14,7 @@ from loopcal.results.tables import (
     format_with_uncertainty,
     render_text,
     word_column,
-    wrap_text,
+    wrap_line,
 )
 
 TABLE = Table(
@@ -76,10 +76,10 @@ def test_csv_and_html_contain_the_same_cells():
 
 
 def test_wrapped_paragraphs_are_indented_and_commands_stay_on_one_line():
-    wrapped = wrap_text("  warning  one two three four five six seven", 28)
-    assert wrapped.split("\n")[1].startswith(" " * 11 + "four")
+    wrapped = wrap_line("  warning  one two three four five six seven", 28)
+    assert wrapped[1].startswith(" " * 11 + "four")
     command = "Next: loopcal calibrate a-long-name.yaml another-long-name.csv -o run"
-    assert wrap_text(command, 30) == command  # to be copied
+    assert wrap_line(command, 30) == [command]  # to be copied
     assert render_text(["a", TABLE, "", "b"], 80).split("\n")[:2] == ["a", ""]
     assert "\n\n\n" not in render_text(["a", TABLE, "", "b", "", TABLE, "c"], 80)
 

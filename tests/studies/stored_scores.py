@@ -21,6 +21,7 @@ from loopcal.studies.specification import (
     Study,
 )
 from loopcal.studies.study_result import StudyResult, find_columns
+from tests.studies.studies import compute_block_key
 
 Scores = dict[str, np.ndarray]
 """Name of a score -> its values (t,)."""
@@ -55,7 +56,7 @@ def store_scores(folder: Path, study: Study, compute: Callable[[Cell], Scores]) 
                 scores[:count, find_columns(study, [name])[0]] = values[:count]
             for block in range(study.blocks):
                 part = scores[block * study.block : (block + 1) * study.block]
-                key = study.compute_key(cell, block)
+                key = compute_block_key(study, cell, block)
                 assert store.add_block(key, cell.levels, block, part, 0.1)
     with read_store(folder) as store:
         assert load_specification(store) == study

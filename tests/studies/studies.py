@@ -10,12 +10,15 @@ from typing import Any
 from loopcal.io.robot.robot_file import list_shipped_robots
 from loopcal.studies.simulation.block import compute_block, list_tasks
 from loopcal.studies.specification import (
+    Cell,
     InstrumentLevel,
     MethodLevel,
     PosesLevel,
     Robot,
     Scores,
     Study,
+    compute_key,
+    describe_cell,
 )
 from loopcal.typing import FloatArray
 
@@ -27,6 +30,11 @@ SIGMA = CAMERA.sigma_position
 def read_robot(name: str) -> Robot:
     """Return a shipped robot for studies."""
     return Robot(name, list_shipped_robots()[name].read_text(encoding="utf-8"))
+
+
+def compute_block_key(study: Study, cell: Cell, block: int) -> str:
+    """Return the key of a block of a study."""
+    return compute_key(describe_cell(study, cell) | {"block": block})
 
 
 def make_study(name: str = "linear-delta", **changes: Any) -> Study:

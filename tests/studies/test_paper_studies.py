@@ -36,7 +36,7 @@ from loopcal.studies.specification import (
     PosesLevel,
     Scores,
 )
-from tests.studies.studies import compute_cells, make_study, read_robot
+from tests.studies.studies import compute_block_key, compute_cells, make_study, read_robot
 
 POSE = InstrumentLevel(("pose",), sigma_position=1e-7, sigma_angle=1e-7)
 
@@ -69,14 +69,14 @@ def make_held(method: MethodLevel, **changes):
 
 def test_keys_of_blocks_are_those_of_version_2_of_the_numbers():
     study = make_study()
-    assert study.compute_key(study.cells[0], 0) == FIRST_KEY
+    assert compute_block_key(study, study.cells[0], 0) == FIRST_KEY
     changed = make_study(
         errors={"u": ErrorsLevel(distribution="uniform")},
         methods={"t": MethodLevel("truncated-svd", keep=3)},
         poses={"p": PosesLevel(8, "planned", seed=2)},
         scores=Scores(5, "base"),
     )
-    assert changed.compute_key(changed.cells[0], 1) == SECOND_KEY
+    assert compute_block_key(changed, changed.cells[0], 1) == SECOND_KEY
 
 
 def test_raw_rows_without_noise_find_the_machine_and_stop_at_epsilon():
@@ -294,7 +294,7 @@ methods:
         ("[12]", "{p: {count: 40, choice: plane-line}}", 7, "kinds: [plane, line]"),
         ("[12]", "{p: {count: 41, choice: plane-line}}", 7, "equal groups"),
         ("[12]", "{p: {count: 30, choice: plane-line}}", 7, "at least 4"),
-        ("kinds: [pose]", "kinds: [pose], unused: [w]", 6, "'w' is not measured"),
+        ("kinds: [pose]", "kinds: [pose], unused: [w]", 6, "an unused column is 'w'"),
         ("poses: [12]", "errors:\n  e: {smallest: 0.5}", 8, "distribution: uniform"),
     ],
 )

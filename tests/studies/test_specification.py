@@ -22,7 +22,7 @@ from loopcal.studies.specification import (
     Scores,
     Study,
 )
-from tests.studies.studies import CAMERA, make_study, read_robot
+from tests.studies.studies import CAMERA, compute_block_key, make_study, read_robot
 
 EXAMPLES = sorted((Path(__file__).parents[2] / "examples" / "studies").glob("*.yaml"))
 
@@ -175,7 +175,7 @@ def test_a_study_is_the_same_after_json():
 
 def list_keys(study: Study) -> list[str]:
     """Return the keys of all blocks."""
-    return [study.compute_key(cell, b) for cell in study.cells for b in range(study.blocks)]
+    return [compute_block_key(study, cell, b) for cell in study.cells for b in range(study.blocks)]
 
 
 CHANGES = {

@@ -274,18 +274,12 @@ def _collect_rows(
     return rows, compute_row_errors(data.observations, after.residuals(data.observations))
 
 
-class CombinedChecks(NamedTuple):
-    """What some checks together say of a change of the parameters, and the rest of their rows,
-    which no change of them explains: its chi-square and its degrees of freedom.
+def _combine(
+    uncertainty: FitUncertainty, rows: list[CheckRows]
+) -> tuple[ParameterChanges, float, int]:
+    """Return what some checks together say of a change of the parameters; of the rest of their
+    rows, which no change of them explains, the chi-square and its degrees of freedom.
     """
-
-    changes: ParameterChanges
-    rest: float
-    rest_degrees: int
-
-
-def _combine(uncertainty: FitUncertainty, rows: list[CheckRows]) -> CombinedChecks:
-    """Return what some checks together say."""
     posterior, degrees = uncertainty.posterior, uncertainty.noise.known_degrees
     p, q = len(posterior.unit), rows[0].known.shape[1]
     stacked = np.concatenate(
@@ -305,7 +299,7 @@ def _combine(uncertainty: FitUncertainty, rows: list[CheckRows]) -> CombinedChec
     rest = whole.chi_square - changes.chi_square + float((triangle[p + q :, -1] ** 2).sum())
     rest += sum(check.rest for check in rows)
     count = len(stacked) - changes.degrees + sum(check.rest_degrees for check in rows)
-    return CombinedChecks(changes, max(rest, 0.0), count)
+    return changes, max(rest, 0.0), count
 
 
 def _judge(
@@ -316,14 +310,15 @@ def _judge(
     """
     sizes = [2**i for i in range(len(rows).bit_length()) if 2**i < len(rows)] + [len(rows)]
     combined = [_combine(uncertainty, rows[-size:]) for size in sizes]
-    if not combined[-1].changes.degrees:
+    changes = [changes for changes, *_ in combined]
+    if not changes[-1].degrees:
         raise DataError(report_finding("checks.nothing-determined"))
-    bounds = [each.changes.bound_probability() for each in combined]
+    bounds = [each.bound_probability() for each in changes]
     best = int(np.argmin(np.nan_to_num(bounds, nan=np.inf)))
     tests, robot = len(sizes) + 1, uncertainty.posterior.robot
-    judged = judge_change(combined[best].changes, robot, tests * a_year, false_alarms)
+    judged = judge_change(changes[best], robot, tests * a_year, false_alarms)
     p_value, together = judged.p_value, sizes[best]
-    rest, count = combined[0].rest, combined[0].rest_degrees
+    _, rest, count = combined[0]
     if count:
         p_rest = float(compute_f_tail(count, uncertainty.noise.known_degrees, rest / count))
         p_value, together = min((p_value, together), (p_rest, 0))

@@ -11,7 +11,8 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import ArrayLike
 
-from loopcal.errors import DataError, suggest_names
+from loopcal.checks import check_choice
+from loopcal.errors import DataError
 from loopcal.measure.data_checks import check_strokes, find_outside_strokes
 from loopcal.measure.instrument import SIGMA, Gaussian, Instrument, Noise, Sensor, Uniform
 from loopcal.measure.kinds import KINDS
@@ -188,11 +189,7 @@ def build_instrument(
     }
     sensors, stated = [], list[StatedValue]()
     for i, name in enumerate(description.kinds):
-        if name not in KINDS:
-            raise DataError(
-                f"{name!r} is not a kind of measurement{suggest_names(name, KINDS)}; known kinds "
-                f"are {', '.join(KINDS)}"
-            )
+        check_choice("the kind of measurement", name, KINDS, DataError)
         if name in description.kinds[:i]:
             raise DataError(
                 f"the kind {name!r} occurs twice. Name it once, and add the second one to the "
@@ -244,10 +241,7 @@ def _name_unknown_frames(frames: Sequence[str], kind: object) -> tuple[str, ...]
     possible: tuple[str, ...] = getattr(kind, "allowed_unknown", ())
     names = []
     for frame in frames:
-        if frame not in FRAMES:
-            raise DataError(
-                f"{frame!r} is not a frame that can be unknown. Allowed: base, tool, or both"
-            )
+        check_choice("an unknown frame", frame, FRAMES, DataError)
         names_of_frame = [name for name in FRAMES[frame] if name in possible]
         if not names_of_frame:
             raise DataError(

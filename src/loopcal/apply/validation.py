@@ -214,13 +214,6 @@ class Validation(DrawnResult):
         """In which frame the errors are, in words: the stated one, or the setup that was fitted."""
         return describe_frame(self.after, (*self.alignment["kept"], *self.alignment["fitted"]))
 
-    def improvement(self, index: str = "position", statistic: str = "rms") -> float:
-        """Return how many times smaller a statistic of the prediction error became."""
-        before, after = (
-            getattr(errors.statistics(index), statistic) for errors in (self.before, self.after)
-        )
-        return ErrorChange(before, after, 0.0, 1).times
-
     def changes(self) -> dict[str, ErrorChange]:
         """Return the change of the rms error of each quantity.
 
@@ -241,10 +234,6 @@ class Validation(DrawnResult):
             )
             for quantity, errors in self.after.quantities.items()
         }
-
-    def improvements(self) -> dict[str, float]:
-        """Return how many times smaller (rms) the error of each quantity became; see `changes`."""
-        return {quantity: change.times for quantity, change in self.changes().items()}
 
     def errors(self) -> dict[str, PoseErrors]:
         """Return the errors by name."""

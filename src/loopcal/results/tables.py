@@ -300,14 +300,10 @@ def render_text(blocks: Iterable[Block], width: int) -> str:
         is_table = isinstance(block, Table)
         if (is_table or (after_table and block)) and lines and lines[-1]:
             lines.append("")
-        lines += (block.to_text(width) if is_table else wrap_text(block, width)).split("\n")
+        shown = (block.to_text(width) if is_table else block).split("\n")
+        lines += shown if is_table else (part for line in shown for part in wrap_line(line, width))
         after_table = is_table
     return escape("\n".join(lines), "\n")
-
-
-def wrap_text(text: str, width: int) -> str:
-    """Return text with each line wrapped; continuation lines keep the indentation of theirs."""
-    return "\n".join(_wrap_line(line, width) for line in text.split("\n"))
 
 
 def format_list(labels_and_texts: Sequence[tuple[str, str]]) -> list[str]:
@@ -316,24 +312,23 @@ def format_list(labels_and_texts: Sequence[tuple[str, str]]) -> list[str]:
     return [f"  {label:<{widest}}  {text}" for label, text in labels_and_texts]
 
 
-def _wrap_line(line: str, width: int) -> str:
+def wrap_line(line: str, width: int) -> list[str]:
     """Return one line wrapped; the indentation ends where a second column begins.
 
     A command to copy is not wrapped.
     """
     if len(line) <= width or line.startswith(COMMAND):
-        return line
+        return [line]
     stripped = line.lstrip()
     indent = len(line) - len(stripped)
     column = stripped.find("  ")
     if indent and 0 < column < 20:
         indent += column + len(stripped[column:]) - len(stripped[column:].lstrip())
-    return textwrap.fill(
+    return textwrap.wrap(
         line,
         width,
         subsequent_indent=" " * indent,
         break_long_words=False,
         break_on_hyphens=False,
-        drop_whitespace=True,
         replace_whitespace=False,
-    )
+    ) or [""]

@@ -726,10 +726,6 @@ class Study(StudySettings, Result):
         """Return the trials of a block that count: the last block may have more than are asked."""
         return min(self.block, self.replicates - block * self.block)
 
-    def compute_key(self, cell: Cell, block: int) -> str:
-        """Return the key of a block."""
-        return compute_key(describe_cell(self, cell) | {"block": block})
-
     def to_json(self) -> str:
         """Return the study as JSON, which `from_json` reads."""
         return msgspec.json.encode(self).decode()

@@ -16,8 +16,9 @@ import numpy as np
 from msgspec import convert
 
 from loopcal.apply.simulated_measurements import InstrumentDescription, build_instrument
+from loopcal.checks import check_choice
 from loopcal.diagnose.error_frames import BASE, choose_error_frame, list_unfixed_motions
-from loopcal.errors import DataError, FileError, UnitError, suggest_names
+from loopcal.errors import DataError, FileError, UnitError
 from loopcal.estimate.identification import compute_trial_posterior, identify_trials
 from loopcal.estimate.options import FitOptions
 from loopcal.estimate.penalties import MAP, LeastSquares
@@ -141,9 +142,7 @@ def make_instrument(level: InstrumentLevel, noise: NoiseLevel) -> Instrument:
     instrument = build_instrument(InstrumentDescription(**described))
     known = [column.name for sensor in instrument.sensors for column in sensor.kind.columns]
     for name in level.unused:
-        if name not in known:
-            hint = suggest_names(name, known)
-            raise DataError(f"{name!r} is not measured{hint}; unused may name {', '.join(known)}")
+        check_choice("an unused column", name, known, DataError)
     if set(level.unused) >= set(known):
         raise DataError("the study uses no measured column. Leave at least one")
     return instrument
