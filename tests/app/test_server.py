@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import http.client
 import json
 import os
@@ -262,6 +263,41 @@ def test_work_is_stopped_and_another_waits(start) -> None:
     assert server.tell("/stop") == ""
     assert server.tell("/calibrate") == ""
     assert "42 parameters" in server.wait()["pages"]["calibrate"]
+
+
+def run_script(project: Project, script: Path, text: str, stop_after: float = 60) -> None:
+    """Run a script in place of the commands of a calibration, perhaps stop it."""
+
+    async def run() -> None:
+        project.work = asyncio.create_task(project.run(project.calibrate()))
+        await asyncio.wait([project.work], timeout=stop_after)
+        project.stop()
+        while project.process is not None:
+            await asyncio.sleep(0.01)
+
+    script.write_text(f"#!/bin/sh\n{text}")
+    script.chmod(0o700)
+    asyncio.run(run())
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="a script stands for the commands")
+def test_what_is_stopped_or_killed_leaves_no_page_of_the_result_before(
+    tmp_path, monkeypatch
+) -> None:
+    script = tmp_path / "script"
+    monkeypatch.setattr(sys, "executable", str(script))
+    (tmp_path / "project").mkdir()
+    project = Project(tmp_path / "project")
+    project.add("measurements.csv", DATA)
+    project.change(settings={"robot": "hexapod-42"})
+    for text, code, stop_after in [("sleep 9", "stopped", 0.1), ("kill -9 $$", "killed", 60)]:
+        run_script(project, script, "echo good")
+        assert project.chosen.pages == {"calibrate": "good\n", "report": "good\n"}
+        assert project.chosen.messages == []
+        run_script(project, script, text, stop_after)
+        assert (project.chosen.pages, project.chosen.codes) == ({}, {})
+        assert [word(f"app.{code}") in line for line in project.chosen.messages] == [True]
+        assert Project(project.folder).chosen == project.chosen
 
 
 @pytest.mark.slow

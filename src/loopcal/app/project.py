@@ -267,6 +267,10 @@ class Project:
         environment = {**os.environ, "LOOPCAL_PAGE": "html", "PYTHONIOENCODING": "utf-8"}
         try:
             chosen.messages = []
+            for title in steps:  # these pages go with the files that commands replace
+                chosen.pages.pop(title, None)
+                chosen.codes.pop(title, None)
+            self.store()
             for title, words in steps.items():
                 self.progress = (title, 0, 0)
                 self.version += 1
@@ -277,8 +281,11 @@ class Project:
                 assert self.process.stdout is not None
                 out = asyncio.create_task(self.process.stdout.read())
                 await self._listen(self.process.stderr)
-                chosen.pages[title], code = (await out).decode(), await self.process.wait()
-                chosen.codes[title] = code
+                page, code = (await out).decode(), await self.process.wait()
+                if code < 0:
+                    chosen.messages.append(f"loopcal: {report_finding('app.killed')}")
+                else:
+                    chosen.pages[title], chosen.codes[title] = page, code
                 if code not in (0, 2):
                     return
         finally:
@@ -304,6 +311,7 @@ class Project:
         """End the command that runs, and what it has started."""
         if self.work is not None:
             self.work.cancel()
+            self.chosen.messages.append(f"loopcal: note: {report_finding('app.stopped')}")
         if self.process is not None:
             with suppress(psutil.NoSuchProcess):
                 process = psutil.Process(self.process.pid)
