@@ -41,6 +41,17 @@ def test_priors_of_the_setup_in_a_sheet_count_in_the_plan_and_stay_in_its_sheet(
     assert "tracker.x: {sd: 0.001 mm}" in text
 
 
+def test_prior_of_a_session_is_left_out_and_one_of_nothing_is_refused(loopcal, tmp_path):
+    head = "# kind: position\n# unknown: [frame]\n# noise: {'*': 10 um}\n"
+    for name, known in (("session", "may.frame.x"), ("wrong", "frame-may.x")):
+        text = f"{head}# unknowns: {{{known}: {{sd: 1 mm}}}}\npose,x [mm],y [mm],z [mm]\n"
+        (tmp_path / f"{name}.csv").write_text(text)
+    words = "plan linear-delta --poses 12 --candidates 40"
+    loopcal(f"{words} -o a --like session.csv")
+    assert "unknowns" not in (tmp_path / "a" / "measurements.csv").read_text("utf-8")
+    loopcal(f"{words} -o b --like wrong.csv", "no setup parameter 'frame-may.x'", code=1)
+
+
 @pytest.mark.slow
 def test_planned_station_leads_by_rendered_pictures_to_the_true_machine(loopcal, tmp_path):
     """Board, plan, pictures of a machine with errors, corners, calibration: as a user does it."""

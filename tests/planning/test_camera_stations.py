@@ -74,6 +74,28 @@ def test_every_station_shows_the_whole_board_from_its_front():
         assert not np.isnan(seen).any()
 
 
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_either_side_of_the_platform_may_carry_the_board(side):
+    robot = lc.load_robot("hexapod-42")
+    place = np.array([0.1, 0.0, 0.2 + side * 0.4])
+    sight = lc.LineOfSight(place, np.array([0.0, 0.0, 1.0]), cone=np.pi)
+    options = replace(OPTIONS, constraints=lc.Constraints(sight=sight))
+    instrument, found = choose_station(robot, Image(square=0.01), options, CALIPER)
+    assert found.data["side"] == ("z" if side > 0.0 else "-z")
+    assert found.data["seen"] > 95.0
+    assert instrument.sensors[0].kind.T_board[2, 2] == -side
+
+
+@pytest.mark.parametrize(
+    ("place", "square"), [((0.5, 0.0, 0.2), 0.012), ((0.0, 0.0, 0.21), 0.012), ((0, 0, 1.0), 1e-5)]
+)
+def test_place_without_usable_pictures_promises_nothing(place, square):
+    sight = lc.LineOfSight(np.array(place), np.array([0.0, 0.0, 1.0]), cone=np.pi)
+    options = replace(OPTIONS, constraints=lc.Constraints(sight=sight))
+    with pytest.raises(lc.DataError, match="pictures from there cannot be used"):
+        choose_station(lc.load_robot("hexapod-42"), Image(square=square), options, CALIPER)
+
+
 def test_line_of_sight_fixes_the_station():
     robot = lc.load_robot("linear-delta")
     sight = lc.LineOfSight(np.array([0.5, 0.1, 0.6]), np.array([0.0, 0.0, 1.0]))

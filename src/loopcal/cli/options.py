@@ -747,15 +747,13 @@ CAMERA = "camera"  # word of --measure for pictures of a printed board
 
 
 def make_instrument(
-    stated: Mapping[str, Any],
-    robot: lc.Mechanism | None = None,
-    options: lc.PlanOptions | None = None,
+    stated: Mapping[str, Any], robot: lc.Mechanism | None = None, **placed: Any
 ) -> lc.Instrument:
     """Return the instrument of `INSTRUMENT`, and of `UNKNOWN` and the distribution where they are
     stated: fields of the library's `InstrumentDescription`.
 
     `robot` : gives targets of unknown place an assumed one, and joints their dimension; only needed
-    where there are any. `options` : of a plan, for the place of a camera.
+    where there are any. `placed` : options of a plan, for the place of a camera.
     """
     from loopcal.apply import simulated_measurements
 
@@ -765,7 +763,7 @@ def make_instrument(
         others = (*INSTRUMENT.members, "unknown_frames", "targets")
         sentence = "{reason} takes no {option}. Leave it out, or describe the camera with --like"
         refuse_given(others, "--measure camera", sentence)
-        return _place_camera(robot, board, options)
+        return _place_camera(robot, board, lc.PlanOptions(**placed))
     if board is not None:
         raise DataError("--board belongs to --measure camera. Add it, or leave --board out")
     if (components := described.pop("measure", None)) is not None:
@@ -783,9 +781,7 @@ def make_instrument(
     return instrument if robot is None else simulated_measurements.place_targets(instrument, robot)
 
 
-def _place_camera(
-    robot: lc.Mechanism, file: Path | None, options: lc.PlanOptions | None
-) -> lc.Instrument:
+def _place_camera(robot: lc.Mechanism, file: Path | None, options: lc.PlanOptions) -> lc.Instrument:
     """Return a camera at its best station, and print where that is."""
     from loopcal.io.pictures import choose_board, read_board
     from loopcal.measure.kinds.image import Image

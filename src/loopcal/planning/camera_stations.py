@@ -9,7 +9,9 @@ The chosen station has the smallest error that is predicted of the tool over the
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -23,7 +25,7 @@ from loopcal.mechanism.solutions import Solution
 from loopcal.planning.candidates import draw_candidates
 from loopcal.planning.constraints import PlanOptions
 from loopcal.planning.problem import prepare_problem
-from loopcal.typing import FloatArray, Progress, report_no_progress
+from loopcal.typing import BoolArray, FloatArray, Progress, report_no_progress
 from loopcal.units import Dimension
 
 TILTS = np.radians([10.0, 25.0, 40.0, 55.0])  # between line of sight and normal of the board
@@ -31,14 +33,33 @@ AROUND = np.radians(np.arange(0.0, 360.0, 45.0))  # directions about the normal
 FILLED = 0.92  # share of a picture that the places of the board fill
 DRAWN = 60  # poses by which stations are compared
 CLEAR = 30.0  # width of a square in a picture [px], where it is narrow, whose marker is found
+LEAST, CORNERS, USABLE = 15.0, 8, 0.5
+"""Width of a square [px] and corners that a picture needs, and share of poses with such ones."""
 ALIKE = 0.02  # share by which a station may be worse than the best, if it comes before it
 SIGMA = 0.1  # standard deviation of a corner in a picture [px]
 
 
-def list_stations(robot: Mechanism, camera: Image, poses: Solution) -> Iterator[Image]:
-    """Yield placements of a fixed camera and of a board on the platform that moves to poses."""
-    width, height = camera.square * (np.array(camera.corners) - 1)
-    middle = np.array([0.5 * width, 0.5 * height, 0.0])
+class View(NamedTuple):
+    """How a placed camera sees the board at n poses: its distance (n,) [m], the angle (n,) [deg]
+    between its normal and the line of sight, the width (n,) [px] of a square where it looks
+    narrowest, the share (n,) of corners in the picture, and whether (n,) the picture can be used.
+    """
+
+    camera: Image
+    distance: FloatArray
+    tilt: FloatArray
+    pixels: FloatArray
+    shown: FloatArray
+    is_usable: BoolArray
+
+
+def list_stations(
+    robot: Mechanism, camera: Image, poses: Solution, place: FloatArray | None = None
+) -> Iterator[Image]:
+    """Yield placements of a fixed camera, or of one at a place (3,), and of a board that faces one
+    side of the platform or the other, which moves to poses.
+    """
+    middle = _find_middle(camera)
     tools = (poses.T @ robot.tool)[:, :3, 3]
     center = 0.5 * (tools.min(axis=0) + tools.max(axis=0))
     reach = np.linalg.norm(tools - center, axis=1).max() + np.linalg.norm(middle)
@@ -49,12 +70,17 @@ def list_stations(robot: Mechanism, camera: Image, poses: Solution) -> Iterator[
     for side in (1.0, -1.0):  # where the board faces along the z axis of the platform
         R = np.diag([1.0, -side, -side])  # the z axis of a board leads away from who reads it
         board = geometry.make_pose(R, robot.tool[:3, 3] - R @ middle)
-        for tilt in TILTS:
-            for angle in AROUND:
-                across = np.array([np.cos(angle), np.sin(angle)]) * np.sin(tilt)
-                station = center + distance * home @ np.append(across, side * np.cos(tilt))
-                station = np.round(station / step) * step + 0.0
-                yield replace(camera, T_camera=look_at(station, center), T_board=board)
+        across = [np.array([np.cos(a), np.sin(a)]) * np.sin(t) for t in TILTS for a in AROUND]
+        up = side * np.repeat(np.cos(TILTS), len(AROUND))
+        ahead = np.column_stack([across, up]) @ home.T
+        stations = np.round((center + distance * ahead) / step) * step + 0.0
+        for station in stations if place is None else place[None]:
+            yield replace(camera, T_camera=look_at(station, center), T_board=board)
+
+
+def _find_middle(camera: Image) -> FloatArray:
+    """Return the middle (3,) of a board in its own frame."""
+    return 0.5 * camera.square * np.array([*(n - 1 for n in camera.corners), 0.0])
 
 
 def look_at(station: FloatArray, place: FloatArray) -> FloatArray:
@@ -79,77 +105,67 @@ def choose_station(
     camera : its lens and the board. scales : of the print, see `state_camera`.
     options : their line of sight fixes the station.
 
-    DataError : the camera is on the platform, or no station promises a bounded error.
+    DataError : the camera is on the platform, sees no board, or promises no bounded error.
     """
-    options = options or PlanOptions()
-    camera, stated = state_camera(camera, scales)
-    candidates = draw_candidates(robot, options.constraints, DRAWN, options.seed)
-    stations = _list_allowed(robot, camera, candidates.solution, options)
-    errors = np.full(len(stations), np.inf)
-    noise, every = Gaussian([SIGMA, SIGMA]), np.arange(len(candidates))
-    for i, at in enumerate(stations):
-        placed = Instrument((Sensor(at, noise),), stated)
-        with_few = replace(options, allow_fewer_equations=True)
-        try:
-            found = prepare_problem(robot, placed, with_few, candidates).predict_errors(every)
-        except EstimationError:  # it sees no board, or leaves a frame open without tolerances
-            found = None
-        errors[i] = np.inf if found is None else found.select(options.target)
-        progress(i + 1, len(stations), "stations of the camera")
-    if not np.isfinite(errors).any():
-        raise DataError(report_finding("plan.no-station", robot=robot.name))
-    best = stations[int(np.flatnonzero(errors <= (1.0 + ALIKE) * errors.min())[0])]
-    return Instrument((Sensor(best, noise),), stated), _describe(robot, best, candidates.solution)
-
-
-def _list_allowed(
-    robot: Mechanism, camera: Image, poses: Solution, options: PlanOptions
-) -> list[Image]:
-    """Return the stations whose pictures are clear, if there are any, or those two at the place
-    that the line of sight states.
-    """
-    stations, sight = list(list_stations(robot, camera, poses)), options.constraints.sight
     if camera.mount != "board":
         raise DataError(report_finding("plan.camera-mounted", robot=robot.name))
-    if sight is None:
-        clear = [_watch(at, poses)[2].min() >= CLEAR for at in stations]
-        return [
-            at for at, is_clear in zip(stations, clear, strict=True) if is_clear or not any(clear)
-        ]
-    center = (poses.T @ robot.tool)[:, :3, 3].mean(axis=0)
-    sides = stations[0], stations[-1]
-    return [replace(at, T_camera=look_at(sight.station, center)) for at in sides]
+    options = replace(options or PlanOptions(), allow_fewer_equations=True)
+    camera, stated = state_camera(camera, scales)
+    candidates, sight = draw_candidates(robot, options.constraints, DRAWN, options.seed), None
+    if options.constraints.sight is not None:
+        sight = options.constraints.sight.station
+    poses, noise, every = candidates.solution, Gaussian([SIGMA] * 2), np.arange(len(candidates))
+    views = [_watch(at, poses) for at in list_stations(robot, camera, poses, sight)]
+    usable = [view for view in views if view.is_usable.mean() >= USABLE]
+    if not usable:
+        best = max(views, key=lambda view: view.is_usable.mean())
+        shown = 100.0 * float(best.shown.mean())
+        pixels, tilt = float(np.median(best.pixels)), float(np.median(best.tilt))
+        data = {"shown": shown, "pixels": max(pixels, 0.0), "tilt": tilt}
+        raise DataError(report_finding("plan.board-unseen", **data))
+    usable = [view for view in usable if view.pixels.min() >= CLEAR] or usable
+    errors = np.full(len(usable), np.inf)
+    for i, view in enumerate(usable):
+        placed = Instrument((Sensor(view.camera, noise),), stated)
+        with suppress(EstimationError):  # a frame stays open without tolerances
+            found = prepare_problem(robot, placed, options, candidates).predict_errors(every)
+            errors[i] = np.inf if found is None else found.select(options.target)
+        progress(i + 1, len(usable), "stations of the camera")
+    if not np.isfinite(errors).any():
+        raise DataError(report_finding("plan.no-station", robot=robot.name))
+    best = usable[int(np.flatnonzero(errors <= (1.0 + ALIKE) * errors.min())[0])]
+    return Instrument((Sensor(best.camera, noise),), stated), _describe(robot, best)
 
 
-def _watch(camera: Image, poses: Solution) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return at each pose the distance of the board [m], the angle [deg] between its normal and the
-    line of sight, and the width [px] of its squares where they look narrowest.
-    """
+def _watch(camera: Image, poses: Solution) -> View:
+    """Return how a camera sees the board at poses."""
     T = poses.T @ camera.T_board
-    width, height = camera.square * (np.array(camera.corners) - 1)
-    sight = (T @ [0.5 * width, 0.5 * height, 0.0, 1.0])[:, :3] - camera.T_camera[:3, 3]
+    sight = (T @ [*_find_middle(camera), 1.0])[:, :3] - camera.T_camera[:3, 3]
     distance = np.linalg.norm(sight, axis=1)
     cosine = np.clip((T[:, :3, 2] * sight).sum(axis=1) / distance, -1.0, 1.0)
-    pixels = camera.square * camera.nominal_lens[0] / distance
-    return distance, np.degrees(np.arccos(cosine)), pixels * cosine
-
-
-def _describe(robot: Mechanism, camera: Image, poses: Solution) -> Finding:
-    """Return where the camera stands, and how it sees the board."""
-    distance, tilts, pixels = _watch(camera, poses)
+    pixels = camera.square * camera.nominal_lens[0] / distance * cosine
     each = np.repeat(poses.T, camera.rows_per_pose, axis=0)[None]
     columns = camera.measure(each, np.zeros((1, each.shape[1], 2)))
     seen = camera.hide_unseen(each, columns, camera.nominal_values[None, None])
+    corners = camera.detect_present(seen).reshape(len(T), -1, 2).all(axis=2).sum(axis=1)
+    is_usable = (corners >= min(CORNERS, camera.rows_per_pose)) & (pixels >= LEAST)
+    tilt = np.degrees(np.arccos(cosine))
+    return View(camera, distance, tilt, pixels, corners / camera.rows_per_pose, is_usable)
+
+
+def _describe(robot: Mechanism, view: View) -> Finding:
+    """Return where the camera stands, and how it sees the board."""
+    camera, pixels, tilts = view.camera, view.pixels, view.tilt
     return report_finding(
         "plan.camera-station",
         place=tuple(robot.to_quantity(float(x), Dimension.LENGTH) for x in camera.T_camera[:3, 3]),
-        distance=robot.to_quantity(float(np.median(distance)), Dimension.LENGTH),
+        distance=robot.to_quantity(float(np.median(view.distance)), Dimension.LENGTH),
         side="-z" if camera.T_board[2, 2] > 0.0 else "z",
         pixels=float(pixels.min()),
         is_small=bool(pixels.min() < CLEAR),
         width=camera.size[0],
         tilts=(float(tilts.min()), float(tilts.max())),
-        seen=100.0 * float(camera.detect_present(seen).mean()),
+        seen=100.0 * float(view.shown.mean()),
         squares=tuple(n + 1 for n in camera.corners),
         square=robot.to_quantity(camera.square, Dimension.LENGTH),
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -367,8 +368,10 @@ def plan(
         if opt.is_given("groups") or opt.is_given("points"):
             raise DataError("--groups and --points belong to --measure plane-line. Leave them out")
         if like is None:
-            placed = lc.PlanOptions(constraints=constraints, frame=frame, seed=seed)
-            measuring = opt.make_instrument(unknown | instrument, machine, placed)
+            constraints = _free_board(constraints, unknown)
+            measuring = opt.make_instrument(
+                unknown | instrument, machine, constraints=constraints, frame=frame, seed=seed
+            )
         else:
             described = (*opt.UNKNOWN.members, *opt.INSTRUMENT.members)
             sentence = "{reason} describes the instrument. Leave out {option}, or --like"
@@ -421,6 +424,13 @@ def plan(
         *(f"Written to {output}: {written}", suggest_command(*following)),
     ]
     return Output(document, lambda: page)
+
+
+def _free_board(constraints: lc.Constraints, unknown: Mapping[str, Any]) -> lc.Constraints:
+    """Return constraints by which a board faces either side, unless --facing states one."""
+    if unknown["measure"] != (opt.CAMERA,) or not constraints.sight or opt.is_given("facing"):
+        return constraints
+    return replace(constraints, sight=replace(constraints.sight, cone=math.pi))
 
 
 def _read_measured(paths: tuple[Path, ...], robot: lc.Mechanism) -> lc.Measurements:

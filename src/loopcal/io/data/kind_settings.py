@@ -443,11 +443,14 @@ def read_setup_priors(file: YamlFile, kinds: Sequence[KindRows]) -> tuple[Stated
     """Return the knowledge of setup parameters that settings state for all sessions."""
     priors = [value for entry in kinds for value in entry.shared_errors]
     stated = file.content.get(KEY, {})
-    for entry in kinds:
-        for pattern, node in stated.items() if isinstance(stated, dict) else ():
-            parameters = entry.kind.nuisance_parameters
-            if matching := [p for p in parameters if fnmatchcase(p.name, pattern)]:
-                priors += _read_one(file, node, matching, (KEY, pattern))
+    parameters = [p for entry in kinds for p in entry.kind.nuisance_parameters]
+    for pattern, node in stated.items() if isinstance(stated, dict) else ():
+        matching = [p for p in parameters if fnmatchcase(p.name, pattern)]
+        # what is known of one session holds for no other, but must be a parameter
+        if not any(fnmatchcase(p.name, pattern.partition(".")[2]) for p in parameters):
+            matching = matching or _match(file, parameters, pattern)
+        for known in {p.name: p for p in matching}.values():
+            priors += _read_one(file, node, [known], (KEY, pattern))
     return tuple(dict.fromkeys(priors))
 
 
