@@ -94,10 +94,8 @@ def _build_triangle_table(robot: Mechanism) -> Table:
         numbers = [format_in(length, float(end)) for end in compute_range(terms)]
         angles = [format_in(angle, end) for end in middle + ends]
         rows.append((actuator.name, *numbers, length.symbol, *angles, angle.symbol))
-    lengths, angles = (
-        map(Column, titles)
-        for titles in (("shortest", "longest"), ("joint at shortest", "at longest"))
-    )
+    lengths = map(Column, ("shortest", "longest"))
+    angles = map(Column, ("joint at shortest", "at longest"))
     caption = "Triangles: dead points of a drive"
     return make_table(caption, ("drive", *lengths, "unit", *angles, "unit"), rows)
 

@@ -208,8 +208,7 @@ def list_changed_files(path: Path, kind: FolderKind) -> tuple[str, ...]:
     """Return the files of a folder that differ from what was written; without a list of files the
     document itself, because nothing is known of it.
     """
-    document = _read_document(path / kind.document)
-    listed = {} if document is None else _list_digests(document)
+    listed = _list_digests(_read_document(path / kind.document) or {})
     if kind.document not in listed:
         return (kind.document,)
     present = (name for name in listed if (path / name).is_file())
@@ -258,8 +257,7 @@ def describe_leftover(path: Path, document: str) -> str:
 
 def _is_own(folder: Path, kind: FolderKind) -> bool:
     """Return whether a leftover only contains what loopcal wrote: a part of a result, or all."""
-    document = _read_document(folder / kind.document)
-    listed = {} if document is None else _list_digests(document)
+    listed = _list_digests(_read_document(folder / kind.document) or {})
     try:
         return folder.is_dir() and not any(
             not _is_expected(folder, name, kind, listed)

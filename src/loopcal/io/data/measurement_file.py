@@ -562,10 +562,8 @@ def join_tables(
     ]
     with name_files(*(table.path for table in tables)):
         entries = [entry for of_file in read for entry in of_file]
-        of_poses, on_base = (
-            [entry for entry in entries if entry[0].kind.is_of_base == flag]
-            for flag in (False, True)
-        )
+        of_poses = [entry for entry in entries if not entry[0].kind.is_of_base]
+        on_base = [entry for entry in entries if entry[0].kind.is_of_base]
         data = Measurements(
             robot.name,
             readings,

@@ -24,7 +24,7 @@ from dataclasses import dataclass, replace
 from datetime import datetime
 from decimal import Decimal
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import numpy as np
 import regex
@@ -590,11 +590,8 @@ def fill_sheet(
                 identical += [name_point(pose, t, targets) for t in _list_measured(row, targets)]
     if not filled:
         wanted = [name_point(p, t, targets) for p in table.pose_names() for t in targets]
-        code = "sheet.no-name-matches"
-        raise FileError(
-            report_finding(code, exported=_shorten(unknown), wanted=_shorten(wanted)),
-            Path(exports[0]),
-        )
+        names: dict[str, Any] = {"exported": _shorten(unknown), "wanted": _shorten(wanted)}
+        raise FileError(report_finding("sheet.no-name-matches", **names), Path(exports[0]))
     findings = _report_counts(table, filled, targets)
     for code, names in (("points-unknown", unknown), ("points-identical", identical)):
         if names:
@@ -679,11 +676,9 @@ def _name_rows(
         return [(row.pop("pose"), row) for row in rows]
     poses, k = table.pose_names(), max(len(getattr(entry.kind, "targets", ())), 1)
     if len(rows) != len(poses) * k:
-        wanted, count = len(poses) * k, len(rows)
-        code = "sheet.count-differs"
-        raise FileError(
-            report_finding(code, wanted=wanted, poses=len(poses), targets=k, count=count), export
-        )
+        counts: dict[str, Any] = {"wanted": len(poses) * k, "poses": len(poses)}
+        counts |= {"targets": k, "count": len(rows)}
+        raise FileError(report_finding("sheet.count-differs", **counts), export)
     return [
         (poses[i // k], {n: c for n, c in row.items() if n != "pose"}) for i, row in enumerate(rows)
     ]
@@ -734,12 +729,8 @@ def _report_counts(
     poses = len(table.pose_names())
     findings = [report_finding("sheet.filled", points=points, filled=len(filled), poses=poses)]
     if missing:
-        wanted = poses * len(targets)
-        findings.append(
-            report_finding(
-                "sheet.points-missing", names=tuple(missing), count=len(missing), wanted=wanted
-            )
-        )
+        counts: dict[str, Any] = {"count": len(missing), "wanted": poses * len(targets)}
+        findings.append(report_finding("sheet.points-missing", names=tuple(missing), **counts))
     if repeated:
         findings.append(report_finding("sheet.points-repeated", names=tuple(repeated)))
     return findings

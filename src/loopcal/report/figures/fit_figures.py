@@ -142,11 +142,8 @@ def draw_residual_rows(
     residuals : of a fit or of a run folder. setup : names of the fitted setup parameters.
     """
     series = [s for s in list_series(robot, residuals) if len(s.raw)]
-    styles, quantities, poses = (
-        _choose_styles(series),
-        _list_quantities(series),
-        _list_poses(residuals),
-    )
+    styles, quantities = _choose_styles(series), _list_quantities(series)
+    poses = _list_poses(residuals)
     groups: dict[tuple[str, Dimension], list[ResidualSeries]] = {}
     for s in series:  # those of one kind and dimension share an axis
         groups.setdefault((s.kind, s.dimension), []).append(s)

@@ -530,10 +530,8 @@ def draw_run_shifts(comparison: RunComparison) -> Figure:
     axes, handles, y, lines = figure.add_subplot(), [], np.arange(len(names)), []
     words = {True: "has changed", False: "no change", None: "not tested"}
     for k, pair in enumerate(comparison.pairs, 1):  # the first run has color and marker 0
-        shifts, style = (
-            [pair.find_shift(name) for name in names],
-            {**_choose_style(k), "ls": "none"},
-        )
+        shifts = [pair.find_shift(name) for name in names]
+        style = {**_choose_style(k), "ls": "none"}
         size = np.array([shift / sd if sd > 0.0 else np.nan for shift, sd, _ in shifts])
         significant = np.array([flag for _, _, flag in shifts])
         offset = 0.5 * k / (len(comparison.pairs) + 1) - 0.25
