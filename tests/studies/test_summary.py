@@ -189,7 +189,7 @@ def test_errors_before_stand_beside_those_after_and_results_at_the_step_limit_co
 
 def test_files_have_every_factor_as_a_column_and_are_read_back(result: StudyResult) -> None:
     summary = result.summarize()
-    write_summary(result.folder, result.study, summary)
+    write_summary(result.folder, result.study, summary, (), {})
     with (result.folder / "summary.csv").open(encoding="utf-8", newline="") as stream:
         rows = list(csv.DictReader(stream))
     assert len(rows) == 12

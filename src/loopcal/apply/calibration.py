@@ -417,8 +417,7 @@ def _search_before_split(
     check = find_outliers(whole, together, level=SEARCH_LEVEL)
     if not check.names:
         return []
-    found: dict[str, Any] = {"poses": check.names, "blocks": check.blocks}
-    return [report_finding(ALL_POSES, **found)]
+    return [report_finding(ALL_POSES, poses=check.names, blocks=check.blocks)]
 
 
 def _validate(

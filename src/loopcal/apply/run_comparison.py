@@ -420,11 +420,8 @@ def _find_row_noise(run: Run) -> dict[str, FloatArray]:
             continue
         usable = np.isfinite(raw) & np.isfinite(whitened) & (whitened != 0.0)
         ratio = np.abs(raw) / np.where(usable, np.abs(whitened), np.inf)
-        medians = [
-            float(np.median(column[mask])) if mask.any() else 0.0
-            for column, mask in zip(ratio.T, usable.T, strict=True)
-        ]
-        result[name.split("_", 2)[2]] = np.array(medians)
+        medians = np.ma.median(np.ma.array(ratio, mask=~usable), axis=0)
+        result[name.split("_", 2)[2]] = medians.filled(0.0)
     return result
 
 

@@ -286,7 +286,7 @@ class Dask(_PooledExecutor):
                 code = "workers.cluster-without-workers"
                 finding = report_finding(code, address=address, seconds=patience)
                 raise StudyError(finding) from None
-            yield _DaskPool(client, address)
+            yield _DaskPool(distributed, client, address)
         finally:
             with suppress(OSError, TimeoutError):
                 client.close()
@@ -295,10 +295,9 @@ class Dask(_PooledExecutor):
 class _DaskPool:
     """A dask cluster as a `Pool`."""
 
-    def __init__(self, client: Any, address: str) -> None:
-        self._client, self._address = client, address
+    def __init__(self, distributed: Any, client: Any, address: str) -> None:
+        self._distributed, self._client, self._address = distributed, client, address
         self._count, self._end = 0, 0.0
-        distributed = import_optional("distributed", "dask", StudyError)
         self._finished = distributed.as_completed(loop=client.loop)
 
     def count_slots(self) -> int:
@@ -323,7 +322,7 @@ class _DaskPool:
         return [next(self._finished)]
 
     def take(self, handle: Any) -> tuple[Any, float]:
-        distributed = import_optional("distributed", "dask", StudyError)
+        distributed = self._distributed
         try:
             return handle.result()
         except distributed.KilledWorker as error:

@@ -687,13 +687,11 @@ class Study(StudySettings, Result):
     effects: Mapping[str, EffectsLevel] = field(default_factory=lambda: {"none": EffectsLevel()})
     order: tuple[str, ...] = ("robot",)
 
-    def _repr_html_(self) -> str:
-        """Return title, size and factors as HTML."""
-        from loopcal.results.notebook import render_html
-
+    def page(self) -> list[Any]:
+        """Return title, size and factors."""
         factors = [f"{name}: {', '.join(self.levels[name])}" for name in self.order]
         size = f"{len(self.cells)} cells of {self.replicates} trials, seed {self.seed}"
-        return render_html(["\n".join([f"{self.title}: {size}", *factors])])
+        return ["\n".join([f"{self.title}: {size}", *factors])]
 
     @cached_property
     def levels(self) -> dict[str, Mapping[str, Any]]:

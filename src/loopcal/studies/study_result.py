@@ -82,13 +82,10 @@ class StudyResult(TableResult):
         """The study."""
         return read_study(self.folder)
 
-    def _repr_html_(self) -> str:
-        """Return the summary of all cells as HTML."""
-        from loopcal.results.notebook import render_html
-
+    def page(self) -> list[Block]:
+        """Return the summary of all cells."""
         summary = self.summarize()
-        shown = list_shown(self.study, summary)
-        return render_html(view_summary(self.study, summary, shown))
+        return view_summary(self.study, summary, list_shown(self.study, summary))
 
     def summarize(self) -> StudySummary:
         """Return medians, quantiles and coverage of all cells, with intervals."""
@@ -789,7 +786,6 @@ def _percent(share: float) -> str:
 JSON, CSV = "summary.json", "summary.csv"
 """Files of a summary in the folder of its study."""
 
-NO_FIGURES: Mapping[str, bytes] = {}
 # Scores of the table on the screen by default.
 SHOWN = ("position", "orientation", "position_base", "covered_parameters")
 # SI symbol -> unit on the screen.
@@ -847,8 +843,8 @@ def write_summary(
     folder: Path,
     study: Study,
     summary: StudySummary,
-    answered: Sequence[AnsweredQuestion] = (),
-    figures: Mapping[str, bytes] = NO_FIGURES,
+    answered: Sequence[AnsweredQuestion],
+    figures: Mapping[str, bytes],
 ) -> None:
     """Write summary.json, with the answered questions, summary.csv, and figures (name -> content)
     into the folder of a study.
