@@ -590,8 +590,8 @@ def fill_sheet(
                 identical += [name_point(pose, t, targets) for t in _list_measured(row, targets)]
     if not filled:
         wanted = [name_point(p, t, targets) for p in table.pose_names() for t in targets]
-        names: dict[str, Any] = {"exported": _shorten(unknown), "wanted": _shorten(wanted)}
-        raise FileError(report_finding("sheet.no-name-matches", **names), Path(exports[0]))
+        facts: dict[str, Any] = {"exported": _shorten(unknown), "wanted": _shorten(wanted)}
+        raise FileError(report_finding("sheet.no-name-matches", **facts), Path(exports[0]))
     findings = _report_counts(table, filled, targets)
     for code, names in (("points-unknown", unknown), ("points-identical", identical)):
         if names:
