@@ -300,6 +300,30 @@ def test_what_is_stopped_or_killed_leaves_no_page_of_the_result_before(
         assert Project(project.folder).chosen == project.chosen
 
 
+def test_another_plan_waits_until_measured_rows_are_removed(tmp_path) -> None:
+    project = Project(tmp_path)
+    lines = DATA.decode().splitlines()
+    first = next(i for i, line in enumerate(lines) if line.startswith("pose,")) + 1
+    empty = [",".join(line.split(",")[:7] + [""] * 6) for line in lines[first:]]
+    project.add("measurements.csv", "\n".join([*lines[:first], *empty, ""]).encode())
+    project.change(settings={"robot": "hexapod-42"})
+    plan = ("position", "30", "", "5um")
+    assert "plan" in project.plan(*plan)
+    for _ in range(2):
+        assert project.measure() == {}
+        assert project.session is not None
+        project.tell("", "1", ["0"] * len(project.session.journal.columns))
+        project.finish()
+        assert project.describe()["is_begun"]
+        with pytest.raises(DataError) as caught:
+            project.plan(*plan)
+        assert caught.value.code == "app.measured"
+        project.discard()
+        assert not project.describe()["is_begun"]
+        assert project.data == ["measurements.csv"]
+        assert "plan" in project.plan(*plan)
+
+
 @pytest.mark.slow
 def test_a_kept_folder_is_gone_on_with(start, tmp_path) -> None:
     words = ("--keep", str(tmp_path / "kept"))

@@ -78,11 +78,13 @@ const choice = (options, value, props) => h("select", props, ...Object.entries(o
 
 function drawFiles() {
   const formats = Object.fromEntries(state.formats.map((name) => [name, `file of ${name}`]));
-  draw("list", state.kinds, () => Object.entries(state.kinds).map(([name, kind]) => h("li", {},
+  const begun = () => h("li", {}, h("b", { textContent: "Rows that were measured here" }),
+    h("button", { textContent: "Remove", ariaLabel: "Remove the rows that were measured here", data: { "data-key": "session" }, onclick: () => ask("discard") }));
+  draw("list", [state.kinds, state.is_begun], () => [state.is_begun ? begun() : null, ...Object.entries(state.kinds).map(([name, kind]) => h("li", {},
     h("b", { textContent: name }),
     choice({ ...KINDS, ...formats }, kind, { ariaLabel: `Kind of ${name}`, data: { "data-key": `kind ${name}` },
       onchange: (event) => ask("change", { kinds: { [name]: event.target.value } }) }),
-    h("button", { textContent: "Remove", ariaLabel: `Remove ${name}`, data: { "data-key": name }, onclick: () => ask("change", { remove: name }) }))));
+    h("button", { textContent: "Remove", ariaLabel: `Remove ${name}`, data: { "data-key": name }, onclick: () => ask("change", { remove: name }) })))]);
   draw("questions", state.questions, () => state.questions.map((key) => h("label", {},
     QUESTIONS[key] ?? `Noise (${key.replace("sigma_", "")}), such as 0.02mm`,
     h("input", { value: state.settings[key] ?? "", size: 12, onchange: (event) => ask("change", { settings: { [key]: event.target.value } }) }))));
@@ -234,7 +236,7 @@ function drawAll() {
   const name = state.program ?? state.robot;
   $("machine").textContent = name ? base(name) : "";
   document.title = name ? `${base(name)} - loopcal` : "loopcal";
-  document.body.classList.toggle("has-files", Object.keys(state.kinds).length > 0);
+  document.body.classList.toggle("has-files", state.is_begun || Object.keys(state.kinds).length > 0);
   drawFiles();
   drawResult();
   drawSession();

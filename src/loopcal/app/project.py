@@ -231,7 +231,9 @@ class Project:
         return {"report": ["report", RUN, "-o", REPORT, "--pdf", "--force"]}
 
     def plan(self, instrument: str, poses: str, accuracy: str, sigma: str) -> dict[str, list[str]]:
-        """Plan which poses to measure."""
+        """Plan which poses to measure, unless rows of another plan are there."""
+        if (self.folder / "session").exists():
+            raise DataError(report_finding("app.measured"))
         options = [*INSTRUMENTS[instrument], f"--sigma-position={sigma}" if sigma else ""]
         options += [f"--accuracy={accuracy}" if accuracy else f"--poses={poses}"]
         words = ["plan", self.robot, "-o", "plan", "--force", *filter(None, options)]
@@ -417,6 +419,12 @@ class Project:
         self.session, self.chosen.is_measured = None, self.has(SESSION)
         self.forget()
 
+    def discard(self) -> None:
+        """End measuring, and remove its rows."""
+        self.opened.close()
+        shutil.rmtree(self.folder / "session", ignore_errors=True)
+        self.finish()
+
     # What a page shows
 
     def describe(self) -> dict[str, Any]:
@@ -426,6 +434,7 @@ class Project:
         shown |= {"robots": list(list_shipped_robots()), "questions": self._list_questions()}
         shown["formats"] = list_formats("read")
         shown |= {"program": program, "most": UPLOAD_SIZE.count, "session": None}
+        shown["is_begun"] = (self.folder / "session").exists()
         shown["downloads"] = [name for name in self.list_downloads() if self.has(name)]
         if session is not None:
             shown["session"] = {

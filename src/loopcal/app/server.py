@@ -57,7 +57,7 @@ ASSETS = {  # address -> file and its type; the style of the report comes first 
 }
 ACTIONS = (
     "change", "calibrate", "print_report", "plan", "correct", "leave_out", "measure", "tell",
-    "finish",
+    "finish", "discard",
 )  # fmt: skip
 STATUS = {"app.denied": 403, "app.foreign": 403, "app.gone": 404}
 
