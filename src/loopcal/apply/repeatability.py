@@ -51,7 +51,6 @@ LARGEST_NOISE = 0.25
 EXPANSION = 2.0
 FEWEST_VISITS = 2  # visits without which there is no scatter
 NORMAL = 1.959963984540054  # quantile of the normal distribution for intervals of 95 %
-LARGE = 1e3  # square of the mean over its variance beyond which its length is normal
 SMALLEST_SHARE = 0.05  # share of the variance that the direction of the mean has at least
 DRAWS = 1000  # drawn sets of visits for the interval of RP_l
 MANY = 20  # times as many visits give the true RP_l of a scatter

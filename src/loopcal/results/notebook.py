@@ -17,7 +17,6 @@ from loopcal.results.tables import Block, Column, Table, format_number
 
 MOST_ROWS = 30  # rows of a table that a notebook shows
 MOST_COLUMNS = 16  # columns of a table on a page
-EXTRA = "tables"  # extra of loopcal that installs pandas and xarray
 # Left for words, right for numbers; colors are those of the notebook.
 STYLE = (
     "<style>.loopcal pre{white-space:pre-wrap;margin:0.3em 0}"
@@ -64,15 +63,9 @@ def _format(value: Any) -> str:
     return str(value)
 
 
-def build_frame(records: Records) -> Any:
-    """Return the main table of a result as a pandas DataFrame."""
-    pandas = import_optional("pandas", EXTRA)
-    return pandas.DataFrame(records.list_columns())
-
-
 def build_dataset(records: Records) -> Any:
     """Return the arrays of a result as an xarray Dataset."""
-    xarray = import_optional("xarray", EXTRA)
+    xarray = import_optional("xarray", "tables")
     arrays, units = {}, {}
     for variable in records.variables:
         axis, unit = variable.dimensions[-1], variable.unit

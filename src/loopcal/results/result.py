@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from loopcal.environment import import_optional
 from loopcal.findings import Finding, Severity
 from loopcal.results.description import Field, Records, Source, collect_records
 from loopcal.results.presenters import draw, find_presenter
@@ -97,9 +98,7 @@ class TableResult(Result):
 
         MissingPackageError : pandas is not installed.
         """
-        from loopcal.results.notebook import build_frame
-
-        return build_frame(self.records())
+        return import_optional("pandas", "tables").DataFrame(self.records().list_columns())
 
     def to_dataset(self) -> Any:
         """Return the arrays as an xarray Dataset; the attribute `units` of each states its unit.

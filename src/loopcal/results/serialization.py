@@ -44,7 +44,11 @@ def to_json(value: Any, nulls: dict[str, str] | None = None, path: tuple[str, ..
     if isinstance(value, int | str):  # of a class of its own, as from YAML
         return value
     if isinstance(value, float):
-        return _finite(float(value), nulls, path)
+        if math.isfinite(value):
+            return float(value)
+        if nulls is not None:
+            nulls["/".join(path)] = UNDEFINED if math.isnan(value) else INFINITE
+        return None
     if (to_list := getattr(value, "tolist", None)) is not None:  # arrays and numbers of numpy
         return to_json(to_list(), nulls, path)
     if isinstance(value, Path):
@@ -104,15 +108,6 @@ def _content(value: Any) -> Any:
     if dataclasses.is_dataclass(value):
         return json_fields(value)
     return value._asdict() if hasattr(value, "_asdict") else value
-
-
-def _finite(value: float, nulls: dict[str, str] | None, path: tuple[str, ...]) -> float | None:
-    """Return a finite number; None for any other, with the reason in `nulls`."""
-    if math.isfinite(value):
-        return value
-    if nulls is not None:
-        nulls["/".join(path)] = UNDEFINED if math.isnan(value) else INFINITE
-    return None
 
 
 def _key(key: Any) -> str:
