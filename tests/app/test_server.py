@@ -115,6 +115,39 @@ def test_macros_beside_a_configuration_are_logs_and_settings_stay_allowed_ones(t
     assert not any("/etc" in word for word in words)
 
 
+CONFIG = b"[printer]\nkinematics: delta\n"
+
+
+def test_what_is_given_decides_robot_data_and_commands_alike(tmp_path) -> None:
+    project = Project(tmp_path)
+    project.add("printer.cfg", CONFIG)
+    assert (project.robot, project.data) == ("result/printer.yaml", ["result/printer.csv"])
+    assert "--data" in project.calibrate()["import"]
+    assert "--data" not in project.plan("height", "9", "", "")["import"]
+    (tmp_path / "result" / "printer.yaml").touch()  # by the plan
+    assert "--data" in project.calibrate()["import"]
+    (tmp_path / "result" / "printer.csv").touch()
+    assert "import" not in project.calibrate()
+    project.add("hex.yaml", b"family: gough\n")
+    assert (project.robot, project.data) == ("hex.yaml", [])
+    with pytest.raises(DataError) as caught:
+        project.calibrate()
+    assert caught.value.code == "app.incomplete"
+    assert list(project.plan("height", "9", "", "")) == ["plan"]
+
+
+def test_another_configuration_takes_the_place_of_the_first_and_says_so(tmp_path) -> None:
+    project = Project(tmp_path)
+    for name in ("printer.cfg", "printer.cfg", "printer2.cfg"):
+        assert project.chosen.messages == []
+        project.add(name, CONFIG)
+    assert project.chosen.kinds == {"printer.cfg": "other", "printer2.cfg": "klipper"}
+    assert "printer.cfg" in project.chosen.messages[0]
+    assert project.program == "printer2.cfg"
+    project.add("config.g", REPRAP.encode())
+    assert project.program == "config.g"
+
+
 def test_without_the_extra_the_command_says_how_to_install_it(monkeypatch, capsys) -> None:
     monkeypatch.setitem(sys.modules, "tornado.web", None)
     assert main(["app", "--no-browser"]) == 1

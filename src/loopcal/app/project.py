@@ -158,16 +158,22 @@ class Project:
         return next((name for name, kind in self.chosen.kinds.items() if kind not in KINDS), None)
 
     @property
+    def imported(self) -> list[str]:
+        """The name, without ending, of what is read from the program's file, if it is used."""
+        is_read = self.program and not self.list_files("robot")
+        return [f"result/{Path(self.program or '').stem}"] if is_read else []
+
+    @property
     def robot(self) -> str:
         """The robot file, given or read from the program's, or the name of a shipped robot."""
-        imported = [f"result/{Path(self.program).stem}.yaml"] if self.program else []
+        imported = [f"{name}.yaml" for name in self.imported]
         shipped = set(list_shipped_robots()) & {self.chosen.settings.get("robot")}
         return next(iter([*self.list_files("robot"), *imported, *shipped]), "")
 
     @property
     def data(self) -> list[str]:
         """The measurement files: of the session, given ones, or those in the program's file."""
-        imported = [f"result/{Path(self.program).stem}.csv"] if self.program else []
+        imported = [f"{name}.csv" for name in self.imported]
         return [SESSION] if self.chosen.is_measured else self.list_files("data") or imported
 
     def add(self, name: str, content: bytes) -> None:
@@ -176,10 +182,18 @@ class Project:
         UPLOADS.check(len({*kinds, name}), "page", name)
         write_bytes(self.folder / name, content)
         kind = recognize(self.folder / name)
-        is_first = kind in KINDS or self.program in (None, name)
-        kinds[name] = kind if is_first else "log"  # such as bed.g beside config.g
+        before = self.program if kind not in KINDS and self.program != name else None
+        is_macro = (
+            before is not None and kinds[before] == kind and "probes" in FORMATS[kind].read_options
+        )
+        kinds[name] = "log" if is_macro else kind  # such as bed.g beside config.g
         self.chosen.is_measured &= kind != "data"
         self.forget()
+        if before is not None and not is_macro:
+            kinds[before] = "other"
+            text = report_finding("app.replaced", name=name, before=before)
+            self.chosen.messages = [f"loopcal: note: {text}"]
+            self.store()
 
     def change(
         self, kinds: Mapping[str, str] = {}, settings: Mapping[str, str] = {}, remove: str = ""
@@ -209,7 +223,7 @@ class Project:
 
     def calibrate(self) -> dict[str, list[str]]:
         """Read the program's file, calibrate, write the report and the corrected file."""
-        steps, result, program = self._import(bool(self.data)), self.folder / "result", self.program
+        steps, result, program = self._import(has_data=True), self.folder / "result", self.program
         self.chosen.edits, self.chosen.runs = 0, self.chosen.runs + 1
         for name in ("run", "files"):
             shutil.rmtree(result / name, ignore_errors=True)
@@ -241,14 +255,16 @@ class Project:
 
     def _import(self, has_data: bool) -> dict[str, list[str]]:
         """Return the command that reads the program's file, unless it was read."""
-        if not self.robot:
-            raise DataError(report_finding("app.incomplete", missing="robot"))
-        if not self.program or self.list_files("robot") or self.has(self.robot):
+        if not self.robot or (has_data and not self.data):
+            missing = "measurement file" if self.robot else "robot"
+            raise DataError(report_finding("app.incomplete", missing=missing))
+        is_inside = has_data and not (self.chosen.is_measured or self.list_files("data"))
+        made = [self.robot, *self.data[: int(is_inside)]]
+        if not self.program or not self.imported or all(map(self.has, made)):
             return {}
         (self.folder / "result").mkdir(exist_ok=True)
         words = ["import", self.program, "--format", self.chosen.kinds[self.program]]
-        words += ["-o", self.robot]
-        is_inside = has_data and not (self.chosen.is_measured or self.list_files("data"))
+        words += ["--force", "-o", self.robot]
         words += ["--data", self.data[0]] if is_inside else []
         words += [f"--probes={name}" for name in self.list_files("log")]
         words += [f"--closures={name}" for name in self.list_files("closures")]
