@@ -11,6 +11,7 @@ import loopcal as lc
 from loopcal.geometry import exp_so3, make_pose
 from loopcal.io.data.measurement_file import load_instrument
 from loopcal.io.pictures import read_board
+from loopcal.measure.kinds.image import Image as ImageKind
 from loopcal.measure.simulation import sample_truth
 from tests.io.boards import render
 
@@ -63,7 +64,8 @@ def test_planned_station_leads_by_rendered_pictures_to_the_true_machine(loopcal,
     loopcal(words, "Put the camera at x 150 mm", "loopcal photos PICTURES")
     robot = lc.load_robot("hexapod-42")
     truth = robot.with_values(sample_truth(robot, 1, 8)[0])
-    (sensor,) = load_instrument("plan/measurements.csv", robot).sensors
+    kind = load_instrument("plan/measurements.csv", robot).sensors[0].kind
+    assert isinstance(kind, ImageKind)
     size, shown = (640, 480), read_board("board.yaml")
     lens = np.array([640.0, 641.5, 322.0, 237.0, 0.04, -0.08, 0.0, 0.0, 0.0])
     Path("pictures").mkdir()
@@ -73,7 +75,7 @@ def test_planned_station_leads_by_rendered_pictures_to_the_true_machine(loopcal,
     turned = make_pose(exp_so3(np.array([0.02, -0.01, 0.03])), np.array([0.004, -0.006, 0.01]))
     for i, row in enumerate(row for row in names[1:] if row[place]):
         T = lc.forward(truth, 1e-3 * np.array([row[first : first + 6]], dtype=float)).T[0]
-        seen = np.linalg.inv(sensor.kind.T_camera @ turned) @ T @ sensor.kind.T_board
+        seen = np.linalg.inv(kind.T_camera @ turned) @ T @ kind.T_board
         Image.fromarray(render(shown, seen, lens, size, seed=i)).save(f"pictures/{row[place]}.png")
     loopcal("photos pictures --board board.yaml --poses plan/poses.csv -o plan/points.csv")
     loopcal("calibrate hexapod-42 plan/points.csv -o run", code=(0, 2))

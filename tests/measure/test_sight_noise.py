@@ -26,7 +26,7 @@ WHERE = "# T_base_frame: {x: 2600 mm, y: -1500 mm, z: 300 mm}\n"
 
 
 def make_instrument(sight) -> lc.Instrument:
-    kind = lc.Position(targets=("a", "b"), places=[[0.1, 0, 0], [0, 0.1, 0]], T_base_frame=PLACE)
+    kind = lc.Position(targets=("a", "b"), places=0.1 * np.eye(3)[:2], T_base_frame=PLACE)
     return lc.Instrument((lc.Sensor(kind, lc.Gaussian(np.zeros(6), sight)),))
 
 

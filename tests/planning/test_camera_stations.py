@@ -18,6 +18,13 @@ CALIPER = ((0.0, 3.6e-4),) * 2
 OPTIONS = lc.PlanOptions(n_poses=20, n_candidates=100)
 
 
+def get_camera(instrument: Instrument) -> Image:
+    """Return the placed camera of an instrument."""
+    kind = instrument.sensors[0].kind
+    assert isinstance(kind, Image)
+    return kind
+
+
 def find_errors(robot: lc.Mechanism, instrument: Instrument, poses: np.ndarray) -> np.ndarray:
     """Return rms position errors [m] of calibrated machines after a rigid fit of both frames,
     by scipy.
@@ -58,7 +65,9 @@ def test_delta_from_straight_above_would_end_with_a_larger_error():
     robot = lc.load_robot("linear-delta")
     instrument, _ = choose_station(robot, Image(square=0.01), OPTIONS, CALIPER)
     (sensor,), poses = instrument.sensors, lc.sample_workspace(robot, 30, 1).solution
-    steep = next(iter(list_stations(robot, sensor.kind, poses)))  # 10 deg from the normal
+    steep = next(
+        iter(list_stations(robot, get_camera(instrument), poses))
+    )  # 10 deg from the normal
     other = replace(instrument, sensors=(replace(sensor, kind=steep),))
     here, there = (lc.plan(robot, of, options=OPTIONS).errors.after for of in (instrument, other))
     assert there.position_rms > 1.2 * here.position_rms
@@ -83,7 +92,7 @@ def test_either_side_of_the_platform_may_carry_the_board(side):
     instrument, found = choose_station(robot, Image(square=0.01), options, CALIPER)
     assert found.data["side"] == ("z" if side > 0.0 else "-z")
     assert found.data["seen"] > 95.0
-    assert instrument.sensors[0].kind.T_board[2, 2] == -side
+    assert get_camera(instrument).T_board[2, 2] == -side
 
 
 @pytest.mark.parametrize(
@@ -101,6 +110,6 @@ def test_line_of_sight_fixes_the_station():
     sight = lc.LineOfSight(np.array([0.5, 0.1, 0.6]), np.array([0.0, 0.0, 1.0]))
     options = replace(OPTIONS, constraints=lc.Constraints(sight=sight))
     instrument, _ = choose_station(robot, Image(square=0.01), options, CALIPER)
-    assert instrument.sensors[0].kind.T_camera[:3, 3].tolist() == [0.5, 0.1, 0.6]
+    assert get_camera(instrument).T_camera[:3, 3].tolist() == [0.5, 0.1, 0.6]
     with pytest.raises(lc.DataError, match="fixed camera only"):
         choose_station(robot, Image(mount="camera"), OPTIONS)

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -114,14 +114,18 @@ def choose_station(
     candidates, sight = draw_candidates(robot, options.constraints, DRAWN, options.seed), None
     if options.constraints.sight is not None:
         sight = options.constraints.sight.station
-    poses, noise, every = candidates.solution, Gaussian([SIGMA] * 2), np.arange(len(candidates))
+    poses, noise, every = (
+        candidates.solution,
+        Gaussian(np.full(2, SIGMA)),
+        np.arange(len(candidates)),
+    )
     views = [_watch(at, poses) for at in list_stations(robot, camera, poses, sight)]
     usable = [view for view in views if view.is_usable.mean() >= USABLE]
     if not usable:
         best = max(views, key=lambda view: view.is_usable.mean())
         shown = 100.0 * float(best.shown.mean())
         pixels, tilt = float(np.median(best.pixels)), float(np.median(best.tilt))
-        data = {"shown": shown, "pixels": max(pixels, 0.0), "tilt": tilt}
+        data: dict[str, Any] = {"shown": shown, "pixels": max(pixels, 0.0), "tilt": tilt}
         raise DataError(report_finding("plan.board-unseen", **data))
     usable = [view for view in usable if view.pixels.min() >= CLEAR] or usable
     errors = np.full(len(usable), np.inf)

@@ -173,8 +173,10 @@ def test_an_error_of_the_map_passes_through_the_engine(monkeypatch):
         raise KeyError("no map")
 
     steps = arguments[-1]._replace(move=fail)
+    fold_compared = ENGINES[0].fold_compared
+    assert fold_compared is not None
     with pytest.raises(KeyError, match="no map"):
-        ENGINES[0].fold_compared(*arguments[:-1], steps)
+        fold_compared(*arguments[:-1], steps)
 
 
 @pytest.mark.parametrize("key", ["hexapod", "delta"])

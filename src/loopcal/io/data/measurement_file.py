@@ -704,7 +704,7 @@ def _build_instrument(table: Table, kinds: Sequence[KindRows]) -> Instrument:
     sensors = []
     for entry in kinds:
         sight = {n: entry.noise[n] for n in entry.kind.sight_noise if n in entry.noise}
-        if sight and np.array_equal(getattr(entry.kind, "T_base_frame", None), np.eye(4)):
+        if sight and np.array_equal(getattr(entry.kind, "T_base_frame", np.eye(4)), np.eye(4)):
             finding = report_finding("files.instrument-place-needed")
             raise table.settings.error(finding, (*entry.location, "noise"))
         for column in entry.kind.noise_columns:

@@ -290,7 +290,8 @@ class DeltaFirmware:
         rod, front = file.values.get(("M665", "L")), file.commands["M665"][0]
         if self.has_trims and rod is not None and ":" in rod.text:
             return "a list of lengths in M665 L", rod.line
-        if not self.has_trims and FRONT.match(file.lines[front])[1]:
+        found = FRONT.match(file.lines[front])
+        if not self.has_trims and found and found[1]:
             return "'echo:' in front of M665", front
         known = ((c, file.commands[c][0]) for c in self.others[2] if c in file.commands)
         return next(known, None)
