@@ -17,6 +17,7 @@ import pytest
 
 from loopcal.app.project import Project, clean_name, recognize
 from loopcal.cli.entry_point import main
+from loopcal.cli.hints import find_hint, load_hints
 from loopcal.errors import DataError, FileError
 from loopcal.findings import report_finding
 from tests.app.conftest import EXAMPLE
@@ -146,6 +147,21 @@ def test_another_configuration_takes_the_place_of_the_first_and_says_so(tmp_path
     assert project.program == "printer2.cfg"
     project.add("config.g", REPRAP.encode())
     assert project.program == "config.g"
+
+
+def test_messages_on_the_page_do_not_speak_of_options(tmp_path, monkeypatch, capsys) -> None:
+    monkeypatch.chdir(tmp_path)
+    for is_page in (False, True):
+        if is_page:
+            monkeypatch.setenv("LOOPCAL_PAGE", "html")
+        texts = [str(find_hint(code, None)) for code in load_hints()]
+        for words in ("plan five-bar -o p --sigma-position=abc", "plan no.yaml -o p --what"):
+            assert main(words.split()) == 1
+            texts.append(capsys.readouterr().err)
+        assert [text for text in texts if "--help" in text] == ([] if is_page else texts[-2:])
+        assert not is_page or set(texts[:-2]) == {"None"}
+        assert "abc" in texts[-2]
+        assert ("--sigma-position" in texts[-2]) != is_page
 
 
 def test_without_the_extra_the_command_says_how_to_install_it(monkeypatch, capsys) -> None:

@@ -232,6 +232,8 @@ def _report(
         case click.BadParameter() | click.NoSuchOption():
             path = "loopcal" if error.ctx is None else error.ctx.command_path
             sentence, hint = error.format_message(), f"see {path} --help"
+            if terminal.PAGE in os.environ:
+                sentence, hint = error.message, None
         case click.ClickException():
             sentence = error.format_message()
         case LoopcalError():

@@ -6,6 +6,7 @@ Messages of the library do not know the command line; `main` and the views add t
 
 from __future__ import annotations
 
+import os
 import re
 import shlex
 from collections.abc import Iterable
@@ -14,6 +15,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
+
+from loopcal.cli import terminal
 
 if TYPE_CHECKING:
     from loopcal.findings import Finding
@@ -29,9 +32,12 @@ def load_hints() -> dict[str, str]:
 
 
 def find_hint(code: str | None, command: click.Command | None) -> str | None:
-    """Return the hint for a code; None where there is none, or where this command, if it is known,
-    lacks an option in it. What follows the word `type` is another command.
+    """Return the hint for a code; None where there is none, on the page of `loopcal app`, or where
+    this command, if it is known, lacks an option in it. What follows the word `type` is another
+    command.
     """
+    if terminal.PAGE in os.environ:
+        return None
     hint = load_hints().get(code or "")
     if hint is None or command is None or hint.startswith("type loopcal "):
         return hint
