@@ -164,6 +164,20 @@ def test_messages_on_the_page_do_not_speak_of_options(tmp_path, monkeypatch, cap
         assert ("--sigma-position" in texts[-2]) != is_page
 
 
+@pytest.mark.slow
+def test_a_page_gets_the_rows_that_it_shows(start) -> None:
+    server = start()
+    lines = DATA.decode().splitlines()
+    many = "\n".join([*lines, *(f"m{i},{lines[-1].partition(',')[2]}" for i in range(5000))])
+    server.tell("/many.csv", many.encode(), "PUT")
+    for path, most in [("/rows", 15), ("/rows?all=1&sorted=0", 2000)]:
+        status, headers, body = server.ask("GET", path)
+        assert (status, headers["content-type"].partition(";")[0]) == (200, "application/json")
+        (table,) = json.loads(body)["tables"]
+        assert len(table["rows"]) == most < table["count"]
+        assert len(body) < 250 * most + 1000
+
+
 def test_without_the_extra_the_command_says_how_to_install_it(monkeypatch, capsys) -> None:
     monkeypatch.setitem(sys.modules, "tornado.web", None)
     assert main(["app", "--no-browser"]) == 1

@@ -2,7 +2,6 @@
 // Draws what the server tells of the files, and tells it what people choose. It computes nothing.
 "use strict";
 
-const MOST = 15; // rows of a table that are drawn at first
 const KINDS = { robot: "robot file", data: "measurements", log: "console log", closures: "loop closures", other: "only beside others" };
 const STEPS = { import: "Reading the file", calibrate: "Calibrating", report: "Writing the report", export: "Correcting the file", plan: "Planning" };
 const QUESTIONS = { length_unit: "Unit of lengths, such as mm", home_height: "Height of the home pose, such as 200mm", platform: "Link that is the platform" };
@@ -14,7 +13,7 @@ const ENDED = "loopcal has ended, or was started again. Open the address that it
 
 const $ = (id) => document.getElementById(id);
 const base = (path) => path.split("/").pop();
-let state = null, shown = {}, limit = MOST, rows = null, is_wanted = false;
+let state = null, shown = {}, is_all = false, rows = null, is_wanted = false;
 
 function h(tag, props = {}, ...children) {
   const { data, ...rest } = props;
@@ -119,11 +118,11 @@ function drawResult() {
 }
 
 async function loadRows() {
-  const facts = JSON.stringify([state.data, state.dropped, state.runs, state.edits, state.progress !== null, state.session !== null]);
+  const facts = JSON.stringify([state.data, state.dropped, state.runs, state.edits, state.progress !== null, state.session !== null, is_all, $("sorted").checked]);
   if (shown.rows === facts) return;
   shown.rows = facts;
   if (state.session || state.progress) return;
-  const answer = await fetch("rows");
+  const answer = await fetch(`rows?all=${Number(is_all)}&sorted=${Number($("sorted").checked)}`);
   rows = answer.ok ? await answer.json() : null;
   drawRows();
 }
@@ -131,14 +130,12 @@ async function loadRows() {
 function drawRows() {
   const count = rows ? rows.tables.length : 0;
   $("rows").hidden = !count;
-  draw("tables", [rows, $("sorted").checked, limit], () => (rows?.tables ?? []).flatMap((table) => drawTable(table)));
+  draw("tables", rows, () => (rows?.tables ?? []).flatMap((table) => drawTable(table)));
 }
 
 function drawTable(table) {
-  const listed = [...table.rows], most = Math.max(3, ...listed.map((row) => row[3] ?? 0));
-  const rank = (row) => row[3] ?? (rows.held_out.includes(row[1]) ? -1 : Infinity); // first what the result lacks
-  if ($("sorted").checked) listed.sort((a, b) => rank(b) - rank(a) || 0);
-  const body = listed.slice(0, limit).map(([line, pose, cells, sigma, text]) => {
+  const { most, count } = table;
+  const body = table.rows.map(([line, pose, cells, sigma, text]) => {
     const is_out = rows.dropped.includes(pose), key = `${table.file} ${line}`;
     const use = h("input", { type: "checkbox", checked: !is_out, ariaLabel: `Use pose ${pose}`, data: { "data-key": `use ${key}` },
       onchange: (event) => ask("leave_out", { pose, is_out: !event.target.checked }) });
@@ -151,11 +148,11 @@ function drawTable(table) {
         onclick: () => correct(table, line, pose, cells) })));
   });
   const head = ["pose", "largest residual", "size", "use", "values"].map((text) => h("th", { scope: "col", textContent: text }));
-  const drawn = h("table", {}, h("caption", { textContent: `${base(table.file)}: ${listed.length} rows` }),
+  const drawn = h("table", {}, h("caption", { textContent: `${base(table.file)}: ${count} rows` }),
     h("thead", {}, h("tr", {}, ...head)), h("tbody", {}, ...body));
   const place = h("div", {}, drawn);
   scroll(drawn);
-  if (listed.length > limit) place.append(h("button", { textContent: `Show all ${listed.length} rows`, onclick: () => { limit = Infinity; drawRows(); } }));
+  if (count > body.length && !is_all) place.append(h("button", { textContent: "Show more rows", onclick: () => { is_all = true; loadRows(); } }));
   return [place];
 }
 
@@ -270,7 +267,7 @@ $("calibrate").onclick = () => ask("calibrate");
 $("stop").onclick = () => ask("stop");
 $("measure").onclick = async () => { is_wanted = !await ask("measure"); $("pose-title").focus(); };
 $("finish").onclick = () => ask("finish").then(() => $("calibrate").focus());
-$("sorted").onchange = drawRows;
+$("sorted").onchange = loadRows;
 $("plan").onsubmit = (event) => { event.preventDefault(); ask("plan", Object.fromEntries(new FormData(event.target))); };
 $("row").onsubmit = async (event) => {
   event.preventDefault();

@@ -13,6 +13,7 @@ companion is `loopcal.measuring`, as on the terminal.
 from __future__ import annotations
 
 import asyncio
+import math
 import os
 import re
 import shutil
@@ -338,8 +339,10 @@ class Project:
 
     # Rows
 
-    def list_rows(self) -> dict[str, Any]:
-        """Return the tables of the measurement files, with the largest residual of each pose."""
+    def list_rows(self, most: int, is_sorted: bool) -> dict[str, Any]:
+        """Return the first rows of the measurement files, with the largest residual of each pose;
+        sorted by it, after rows that the result lacks.
+        """
         from loopcal.estimate.result import residuals_from_arrays
         from loopcal.io.runs.run_folder import read_run_folder
 
@@ -355,11 +358,16 @@ class Project:
                     text = f"{of.components[i]} {format_in(unit, raw[i], 3)} {unit.symbol}"
                     found[label] = max(found.get(label, (0.0, "")), (float(white[i]), text))
             found = {label: of for label, of in found.items() if label not in excluded}
+        known = {*found, *held_out}
         for name in filter(self.has, self.data):
             table = read_template(self.folder / name)
             places = zip(table.lines, table.pose_names(), table.rows, strict=True)
             rows = [(*place, *found.get(place[1], (None, ""))) for place in places]
-            tables.append({"file": name, "header": format_header(table.units), "rows": rows})
+            if is_sorted:
+                rows.sort(key=lambda row: -(row[3] or 0.0) if row[1] in known else -math.inf)
+            facts = {"count": len(rows), "most": max([3.0, *(row[3] or 0.0 for row in rows)])}
+            facts |= {"file": name, "header": format_header(table.units), "rows": rows[:most]}
+            tables.append(facts)
         return {"tables": tables, "held_out": held_out, "dropped": self.chosen.dropped}
 
     def correct(self, file: str, line: int, column: int, text: str) -> None:

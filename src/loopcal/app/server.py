@@ -34,9 +34,9 @@ from loopcal.app.project import Project
 from loopcal.errors import DataError, LoopcalError
 from loopcal.findings import report_finding
 from loopcal.io.core.limits import UPLOAD_SIZE
-from loopcal.io.core.text_file import to_json
 
 TICK, HEARTBEAT = 0.1, 30  # seconds between looks; looks after which a page is told all again
+ROWS = (15, 2000)  # of a table that a page gets at first, and at most
 HEADERS = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src "
     "'self' data:; connect-src 'self'; frame-src 'self'; form-action 'none'; base-uri 'none'; "
@@ -118,8 +118,9 @@ class Handler(RequestHandler):
         if name == "events":
             await self._send_events()
         elif name == "rows":
-            self.set_header("Content-Type", "application/json")
-            self.finish(to_json(await asyncio.to_thread(self.project.list_rows)))
+            most = ROWS[self.get_query_argument("all", "") == "1"]
+            is_sorted = self.get_query_argument("sorted", "1") == "1"
+            self.finish(await asyncio.to_thread(self.project.list_rows, most, is_sorted))
         elif name in ASSETS:
             file, kind = ASSETS[name]
             self.set_header("Content-Type", f"{kind}; charset=utf-8")
