@@ -249,6 +249,8 @@ class Project:
         """Plan which poses to measure, unless rows of another plan are there."""
         if (self.folder / "session").exists():
             raise DataError(report_finding("app.measured"))
+        if instrument not in INSTRUMENTS:
+            raise DataError(report_finding("app.wrong"))
         options = [*INSTRUMENTS[instrument], f"--sigma-position={sigma}" if sigma else ""]
         options += [f"--accuracy={accuracy}" if accuracy else f"--poses={poses}"]
         words = ["plan", self.robot, "-o", "plan", "--force", *filter(None, options)]

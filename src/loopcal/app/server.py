@@ -30,7 +30,7 @@ from tornado.iostream import StreamClosedError
 from tornado.netutil import bind_sockets
 from tornado.web import Application, HTTPError, RequestHandler, stream_request_body
 
-from loopcal.app.project import Project
+from loopcal.app.project import Project, check_facts
 from loopcal.errors import DataError, LoopcalError
 from loopcal.findings import report_finding
 from loopcal.io.core.limits import UPLOAD_SIZE
@@ -101,9 +101,10 @@ class Handler(RequestHandler):
 
     def write_error(self, status_code: int, **facts: Any) -> None:
         """Answer with the sentence of an error."""
-        error = facts["exc_info"][1]
-        is_ours, text = isinstance(error, LoopcalError), self.project.word(error)
-        self.set_status(STATUS.get(error.code or "", 400) if is_ours else status_code)
+        text, error = self._reason, facts.get("exc_info", (None, None))[1]
+        if isinstance(error, LoopcalError):
+            text = self.project.word(error)
+            self.set_status(STATUS.get(error.code or "", 400))
         if self.request.path == "/":  # people read it
             self.set_header("Content-Type", "text/plain; charset=utf-8")
         self.finish(text if self.request.path == "/" else {"error": text})
@@ -164,7 +165,11 @@ class Handler(RequestHandler):
         if name == "stop":
             self.project.stop()
         elif name in ACTIONS:
-            await self._act(lambda: getattr(self.project, name)(**json.loads(self.body or b"{}")))
+            action, body = getattr(self.project, name), None
+            with suppress(ValueError):  # None is refused
+                body = json.loads(self.body or b"{}")
+            facts = check_facts(action, body)
+            await self._act(lambda: action(**facts))
         else:
             raise DataError(report_finding("app.gone"))
 
