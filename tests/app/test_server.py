@@ -178,6 +178,18 @@ def test_a_page_gets_the_rows_that_it_shows(start) -> None:
         assert len(body) < 400 * most + 1000  # 13 cells of 18 characters, quoted
 
 
+def test_a_quarter_is_held_out_unless_the_data_or_a_person_state_others(tmp_path) -> None:
+    project = Project(tmp_path)
+    project.change(settings={"robot": "hexapod-42"})
+    project.add("a.csv", b"pose,use\n1,fit\n2,fit\n")
+    assert "--hold-out=0.25" in project.calibrate()["calibrate"]
+    project.change(settings={"hold-out": "0"})
+    assert "--hold-out=0" in project.calibrate()["calibrate"]
+    project.change(settings={"hold-out": ""})
+    project.add("b.csv", b"pose,use\n3,held-out\n")
+    assert not any("hold-out" in word for word in project.calibrate()["calibrate"])
+
+
 def test_without_the_extra_the_command_says_how_to_install_it(monkeypatch, capsys) -> None:
     monkeypatch.setitem(sys.modules, "tornado.web", None)
     assert main(["app", "--no-browser"]) == 1

@@ -32,6 +32,7 @@ from loopcal.findings import Finding, report_finding
 from loopcal.io.core.csv_table import Cells, format_header, format_row, read_template
 from loopcal.io.core.limits import UPLOAD_SIZE, UPLOADS, make_name
 from loopcal.io.core.text_file import read_json, read_text, to_json, write_bytes, write_text
+from loopcal.io.data.columns import HELD_OUT
 from loopcal.io.formats import FORMATS
 from loopcal.io.formats.import_export import list_formats, recognize_format
 from loopcal.io.robot.robot_file import list_shipped_robots
@@ -46,6 +47,7 @@ STATE, REPORT = "choices", "result/files/report.html"
 RUN, SESSION, SHEET = "result/run", "session/measurements.csv", "plan/measurements.csv"
 KINDS = ("robot", "data", "log", "closures", "other")  # of files that are no program's
 FIT = ("hold-out", "noise", "loss")  # options of `calibrate`
+QUARTER = "0.25"  # of the poses, held out unless the data or a person say otherwise
 OPTIONS = {"length_unit": "unit", "home_height": "home-z"}  # of `import`, with other names
 # What an instrument measures -> options of `loopcal plan`.
 INSTRUMENTS = {
@@ -229,7 +231,8 @@ class Project:
         for name in ("run", "files"):
             shutil.rmtree(result / name, ignore_errors=True)
         (result / "files").mkdir(parents=True)
-        given = [(key, self.chosen.settings.get(key)) for key in FIT]
+        default = {"hold-out": "" if self.program or self._states_held_out() else QUARTER}
+        given = [(key, self.chosen.settings.get(key) or default.get(key)) for key in FIT]
         options = [f"--{key}={value}" for key, value in given if value]
         options += [f"--drop={label}" for label in self.chosen.dropped]
         steps["calibrate"] = ["calibrate", self.robot, *self.data, "-o", RUN, *options]
@@ -244,6 +247,13 @@ class Project:
     def print_report(self) -> dict[str, list[str]]:
         """Print the report to a PDF file."""
         return {"report": ["report", RUN, "-o", REPORT, "--pdf", "--force"]}
+
+    def _states_held_out(self) -> bool:
+        """Return whether measurement files name held-out poses, or cannot be read yet."""
+        with suppress(FileError):
+            tables = [read_template(self.folder / name) for name in filter(self.has, self.data)]
+            return any(HELD_OUT in of.text("use") for of in tables if "use" in of.names)
+        return True
 
     def plan(self, instrument: str, poses: str, accuracy: str, sigma: str) -> dict[str, list[str]]:
         """Plan which poses to measure, unless rows of another plan are there."""
@@ -360,14 +370,16 @@ class Project:
                     text = f"{of.components[i]} {format_in(unit, raw[i], 3)} {unit.symbol}"
                     found[label] = max(found.get(label, (0.0, "")), (float(white[i]), text))
             found = {label: of for label, of in found.items() if label not in excluded}
-        known = {*found, *held_out}
+        known, nothing = {*found, *held_out}, (0.0, "")
         for name in filter(self.has, self.data):
             table = read_template(self.folder / name)
             places = zip(table.lines, table.pose_names(), table.rows, strict=True)
             rows = [(*place, *found.get(place[1], (None, ""))) for place in places]
             if is_sorted:
-                rows.sort(key=lambda row: -(row[3] or 0.0) if row[1] in known else -math.inf)
-            facts = {"count": len(rows), "most": max([3.0, *(row[3] or 0.0 for row in rows)])}
+                rows.sort(
+                    key=lambda row: -found.get(row[1], nothing)[0] if row[1] in known else -math.inf
+                )
+            facts = {"count": len(rows), "most": max([3.0, *(of[0] for of in found.values())])}
             facts |= {"file": name, "header": format_header(table.units), "rows": rows[:most]}
             tables.append(facts)
         return {"tables": tables, "held_out": held_out, "dropped": self.chosen.dropped}
