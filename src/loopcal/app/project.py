@@ -50,7 +50,7 @@ FIT = ("hold-out", "noise", "loss")  # options of `calibrate`
 QUARTER = "0.25"  # of the poses, held out unless the data or a person say otherwise
 OPTIONS = {"length_unit": "unit", "home_height": "home-z"}  # of `import`, with other names
 # What an instrument measures -> options of `loopcal plan`.
-INSTRUMENTS = {
+INSTRUMENTS: Mapping[str, tuple[str, ...]] = {
     "position": ("--kind=position", "--frames=base"),
     "pose": ("--kind=pose", "--frames=base"),
     "distance": ("--kind=distance",),
@@ -128,12 +128,14 @@ class Project:
     """The files of one machine; `version` grows when a page is to be drawn again."""
 
     def __init__(self, folder: Path) -> None:
-        self.folder, self.version, self.opened = folder, 0, ExitStack()
+        self.folder: Path = folder
+        self.version: int = 0
+        self.opened: ExitStack[bool | None] = ExitStack()
         if any(folder.iterdir()) and not self.has(STATE):
             raise FileError(report_finding("session.other-content"), folder)
         known = read_json(folder / STATE, "choices", "remove it") if self.has(STATE) else {}
         try:
-            self.chosen = Choices(**check_facts(Choices, known))
+            self.chosen: Choices = Choices(**check_facts(Choices, known))
             kinds = self.chosen.kinds.items()
             is_ours = all(clean_name(n) == n and k in (*KINDS, *FORMATS) for n, k in kinds)
         except DataError:

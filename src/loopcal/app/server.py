@@ -66,11 +66,10 @@ STATUS = {"app.denied": 403, "app.foreign": 403, "app.gone": 404}
 class Handler(RequestHandler):
     """All requests of the page of one project."""
 
-    project: Project
-
     def initialize(self) -> None:
         """Begin with an empty body."""
-        self.project, self.body = self.settings["project"], bytearray()
+        self.project: Project = self.settings["project"]
+        self.body: bytearray = bytearray()
 
     def set_default_headers(self) -> None:
         """Forbid what the page does not need."""
