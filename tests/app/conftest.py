@@ -44,7 +44,7 @@ class Server:
     ) -> tuple[int, dict[str, str], bytes]:
         """Return status, headers and body of an answer; by default with the token."""
         given = {"Cookie": f"loopcal-{self.port}={self.token}"} if headers is None else headers
-        connection = http.client.HTTPConnection(self.host, self.port, timeout=20)
+        connection = http.client.HTTPConnection(self.host, self.port, timeout=60)
         body = json.dumps(body) if isinstance(body, dict) else body
         connection.request(method, path, body, given)
         answer = connection.getresponse()
@@ -74,7 +74,7 @@ class Server:
     def end(self) -> tuple[int, str]:
         """Ask the process to end; return its exit code and what it printed on standard error."""
         self.process.terminate()
-        error = self.process.communicate(timeout=20)[1]
+        error = self.process.communicate(timeout=60)[1]
         return self.process.returncode, error
 
 

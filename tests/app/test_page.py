@@ -28,7 +28,7 @@ pytestmark = [
     pytest.mark.skipif(BROWSER is None, reason="Chromium is not installed"),
 ]
 AXE = (Path(axe.__file__).parent / "axe.min.js").read_text("utf-8")
-DONE = 30_000  # [ms], far more than any command takes
+DONE = 120_000  # ms; both processors may be busy with other tests
 
 
 @pytest.fixture(scope="module")
@@ -141,7 +141,7 @@ def test_a_wrong_row_is_corrected_and_left_out_by_keyboard_alone(server, visit, 
     assert tab.locator("#verdict.failed").count() == 1
     assert "Not calibrated" in tab.inner_text("#verdict")
     worst = tab.locator("#tables tbody tr").first
-    assert worst.locator("th").inner_text() == "18"
+    worst.locator("th", has_text="18").wait_for()  # the rows follow the verdict
     # leave it out
     tab.locator("#sorted").focus()
     walk_to(tab, "Use pose 18")

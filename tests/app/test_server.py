@@ -281,7 +281,7 @@ def test_no_path_leads_out_of_the_list(start, tmp_path) -> None:
 @pytest.mark.slow
 def test_large_and_many_files_are_refused(start) -> None:
     server = start()
-    connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=20)
+    connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=60)
     connection.putrequest("PUT", "/large.csv")
     connection.putheader("Cookie", f"loopcal-{server.port}={server.token}")
     connection.putheader("Content-Length", str(100_000_000))
@@ -318,7 +318,7 @@ def test_an_end_during_work_leaves_no_folder_and_no_process(start, name: str) ->
     children = server.list_children()
     assert children
     os.kill(server.process.pid, getattr(signal, name))
-    error = server.process.communicate(timeout=20)[1]
+    error = server.process.communicate(timeout=60)[1]
     assert (server.process.returncode, error) == (0, "")
     assert list(server.folder.iterdir()) == []
     assert not [child for child in children if child.is_running()]
