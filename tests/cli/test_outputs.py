@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 import loopcal as lc
+from loopcal.cli.entry_point import main
 from loopcal.io.core.text_file import write_text
 from loopcal.io.robot.robot_file import find_robot_file
 
@@ -65,6 +66,42 @@ def test_output_that_would_overwrite_a_file_is_refused_before_writing(loopcal, w
     before = read_all_files()
     loopcal(words, REFUSED[words], code=1)
     assert read_all_files() == before
+
+
+AT_ONCE = {
+    "simulate robot.yaml -o new.csv --truth truth.yaml": {"new.csv", "truth.yaml"},
+    "new 3-prs -o new.yaml": {"new.yaml", "robot.schema.json"},
+    "check robot.yaml --plot new.png": {"new.png"},
+    "board -o board.yaml": {"board.pdf", "board.svg", "board.yaml"},
+    "example hexapod-42 -o folder": {"folder"},
+}
+
+
+@pytest.mark.forks
+@pytest.mark.parametrize("words", AT_ONCE)
+def test_of_two_commands_that_write_the_same_at_once_one_is_told(loopcal, words) -> None:
+    before = {*Path().iterdir()}
+    assert sorted(run_at_once(words.split(), 2)) == [0, 1]
+    assert {str(path) for path in {*Path().iterdir()} - before} == AT_ONCE[words]
+
+
+def run_at_once(words: list[str], count: int) -> list[int]:
+    """Run a command line in processes that begin together; return their exit codes."""
+    gate, opened = os.pipe()
+    processes = []
+    for _ in range(count):
+        processes.append(os.fork())
+        if processes[-1] == 0:
+            code = 70
+            try:
+                os.close(opened)
+                os.read(gate, 1)  # returns when the last process has closed the other end
+                code = main(words)
+            finally:
+                os._exit(code)
+    os.close(gate)
+    os.close(opened)
+    return [os.waitstatus_to_exitcode(os.waitpid(process, 0)[1]) for process in processes]
 
 
 def test_force_replaces_a_file_that_is_not_an_input(loopcal) -> None:

@@ -208,7 +208,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             terminal.silence(sys.stdout)
             return 1
         except (Exception, KeyboardInterrupt) as error:  # noqa: BLE001 the one place for all of them
-            return _report(error, command, words, list_outputs())
+            return _report(error, command, words, tuple(list_outputs()))
 
 
 def _report(

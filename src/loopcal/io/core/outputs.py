@@ -36,6 +36,7 @@ from loopcal.io.core.text_file import (
     watch_folder,
     write_bytes,
 )
+from loopcal.output_record import note_output
 
 FILES = "files"  # key of the list of files in the document of a result folder
 
@@ -71,6 +72,8 @@ def refuse_outputs(
             raise FileError("cannot write here (permission denied). Choose another folder", path)
         if path.is_file() and not force:
             raise FileError(report_finding("files.output-exists"), path)
+        if not force:  # another command may take the name before this one has its result
+            note_output(path, resolve_target(path), None)
         document = _read_document(path) if path.suffix == ".json" and path.is_file() else None
         if isinstance((document or {}).get(FILES), dict):  # that of a result folder
             raise FileError(report_finding("files.output-in-result"), path)

@@ -31,8 +31,9 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from loopcal.errors import DataError, FileError, LoopcalError
+from loopcal.findings import report_finding
 from loopcal.io.core.limits import JSON_DEPTH, JSON_VALUES, PROGRAM_SIZE, FileLimit
-from loopcal.output_record import identify, note_output
+from loopcal.output_record import identify, note_output, record_outputs, was_free
 from loopcal.plain_text import escape_json
 from loopcal.results import serialization
 
@@ -215,11 +216,13 @@ def _take_free_name(temporary: Path, target: Path) -> bool:
 
 @contextmanager
 def restore_files(targets: Sequence[Path]) -> Iterator[None]:
-    """Restore files, or their absence, where the body fails: all of them or none."""
+    """Restore files, or their absence, where the body fails: all of them or none. A new file of
+    another command stays.
+    """
     for target in targets:
         remove_leftovers(target, Path.is_file)
     asides = {target: _name_beside(target, OLD) for target in targets if target.exists()}
-    with ExitStack() as locks:
+    with ExitStack() as locks, record_outputs() as list_outputs:
         try:
             for target, aside in asides.items():
                 try:
@@ -230,11 +233,11 @@ def restore_files(targets: Sequence[Path]) -> Iterator[None]:
             try:
                 yield
             except BaseException:
-                for target in targets:
-                    if target in asides:
-                        asides[target].replace(target)
-                    else:
+                for target in list_outputs().values():
+                    if target in targets and target not in asides:
                         target.unlink(missing_ok=True)
+                for target, aside in asides.items():
+                    aside.replace(target)
                 raise
         finally:
             for aside in asides.values():
@@ -473,9 +476,27 @@ def replace_file(path: str | Path) -> Iterator[Path]:
             sync_file(temporary)
             if target.exists():
                 temporary.chmod(stat.S_IMODE(target.stat().st_mode))
+            is_new = was_free(target)
             note_output(Path(path), target, temporary)
-            temporary.replace(target)
+            if is_new:
+                _take_new_name(temporary, target, path)
+            temporary.replace(target)  # does nothing where both name one file
             sync_folder(target.parent)
+
+
+def _take_new_name(temporary: Path, target: Path, path: str | Path) -> None:
+    """Give a file a second name that was free when the command began; FileError where another
+    command has taken it since.
+    """
+    try:
+        try:
+            target.hardlink_to(temporary)
+        except FileExistsError:
+            raise
+        except OSError:  # the file system has no second names
+            os.close(os.open(target, os.O_WRONLY | os.O_CREAT | os.O_EXCL))
+    except FileExistsError:
+        raise FileError(report_finding("files.output-exists"), path) from None
 
 
 @contextmanager
