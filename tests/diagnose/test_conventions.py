@@ -134,6 +134,7 @@ def unit_slip(quantity: str, factor, **more) -> dict:
 
 STATION = geometry.make_pose(np.eye(3), np.array([-1.5, -0.8, 0.1]))
 XYZ = Pose("euler-xyz")
+SEVERAL = Position(targets=("a", "b"), places=PAIR, unknown=("frame",))
 SLIPS = {
     "milliradians written as radians": (
         "3-prs",
@@ -183,6 +184,24 @@ SLIPS = {
         Distance(targets=("a", "b"), places=PAIR, anchor=PAIR[0] * 9),
         swapped(0, 1),
         {"slip": "swapped-targets", "targets": ("a", "b")},
+    ),
+    "x and y of one of several targets swapped": (
+        "hexapod-42",
+        SEVERAL,
+        swapped(3, 4),
+        {"slip": "swapped-columns", "columns": ("b.x", "b.y")},
+    ),
+    "one column of one target negative": (
+        "hexapod-42",
+        SEVERAL,
+        scaled([5], -1.0),
+        {"slip": "sign", "column": "b.z"},
+    ),
+    "one column of one target in inches": (
+        "hexapod-42",
+        SEVERAL,
+        scaled([3], 1.0 / 25.4),
+        unit_slip("b.x", 25.4),
     ),
     "zenith angles": (
         "hexapod-42",

@@ -68,6 +68,7 @@ TOO_LITTLE_VALIDATION = {
     "validation.blunders-dominate",
 }
 ALL_POSES = "outliers.all-poses"  # finding on outliers before poses were held out
+FAR_OFF = "conventions.rows-far-off"  # finding on rows far off the others before the fit
 LEAVE_OUT = "values.leave-out"  # recommendation to calibrate without a wrong pose
 CHECK_FIRST = "values.check-first"  # recommendation to check what heights do not show
 # Findings that values are beyond their stated expected spreads, and the factor from which another
@@ -508,9 +509,13 @@ class CalibrationReport(DeferredFields, TableResult):
     @property
     def top_findings(self) -> tuple[Finding, ...]:
         """The two or three most important findings; all failures among them, none that says that
-        all is well.
+        all is well, nor single combinations, which `report_freedoms` counts.
         """
-        notable = tuple(f for f in self.findings if not find_entry(f.code).routine)
+        notable = tuple(
+            f
+            for f in self.findings
+            if not find_entry(f.code).routine and f.code != "fit.unidentifiable"
+        )
         return notable[: max(TOP, len(self.failures))]
 
     def list_outliers(self, level: float = 1.0) -> tuple[str, ...]:
@@ -518,7 +523,8 @@ class CalibrationReport(DeferredFields, TableResult):
 
         level : probability, of all tests of the fitted poses, below which one is listed.
         """
-        labels = [label for f in self.findings if f.code == ALL_POSES for label in f.data["poses"]]
+        wrong = (f.data["poses"] for f in self.findings if f.code in (ALL_POSES, FAR_OFF))
+        labels = [label for poses in wrong for label in poses]
         if self.examination is not None:
             check = self.examination.outliers
             clear = (o.poses for o in check.outliers if o.p_value * check.blocks < level)

@@ -393,6 +393,7 @@ def convert_instrument_export(
 
     `local` : the unit of lengths in place of that of the profile, and whether commas are decimal.
     """
+    from loopcal.findings.wording import name_count
     from loopcal.io.core.outputs import refuse_outputs
     from loopcal.io.exports.conversion import convert_export, save_converted
     from loopcal.io.exports.profile import find_profile_file, read_profile, with_local_settings
@@ -415,8 +416,9 @@ def convert_instrument_export(
         "notes": [str(finding) for finding in converted.findings],
         "findings": converted.findings,
     }
+    rows, passed = name_count(converted.rows, "row"), name_count(converted.passed, "line")
     page = [
-        f"{output}: {converted.rows} rows, {converted.passed} lines skipped by the profile",
+        f"{output}: {rows}, {passed} skipped by the profile",
         *(f"note: {with_hint(finding)}" for finding in converted.findings),
         *_note_misfits([(file, *misfit) for misfit in converted.misfits], f", listed in {output}"),
     ]

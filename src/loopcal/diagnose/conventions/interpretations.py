@@ -172,12 +172,12 @@ def _list_units(kind: Kind) -> Iterator[Slip]:
         (name, d, [i for i, column in enumerate(kind.columns) if column.dimension is d], FACTORS[d])
         for d, name in ((Dimension.LENGTH, "lengths"), (Dimension.ANGLE, "angles"))
     ]
-    named = _columns_by_name(kind)
-    dimensions = [kind.columns[columns[0]].dimension for columns in named.values()]
-    for (name, columns), d in zip(named.items(), dimensions, strict=True):
-        if dimensions.count(d) > 1:
-            factors = tuple(f for f in FACTORS.get(d, ()) if f in SINGLE_COLUMN_FACTORS)
-            groups.append((name, d, columns, factors))
+    for named in _list_names(kind):
+        dimensions = [kind.columns[columns[0]].dimension for columns in named.values()]
+        for (name, columns), d in zip(named.items(), dimensions, strict=True):
+            if dimensions.count(d) > 1:
+                factors = tuple(f for f in FACTORS.get(d, ()) if f in SINGLE_COLUMN_FACTORS)
+                groups.append((name, d, columns, factors))
     for name, d, columns, factors in groups:
         for factor in factors if columns else ():
             yield "unit", _describe_unit(name, d, factor), scale_columns(columns, factor)
@@ -229,7 +229,7 @@ def _list_rotations(kind: Kind) -> Iterator[Slip]:
 
 
 def _list_signs(kind: Kind) -> Iterator[Slip]:
-    for name, columns in _columns_by_name(kind).items():
+    for name, columns in chain.from_iterable(named.items() for named in _list_names(kind)):
         yield "sign", {"column": name}, scale_columns(columns, -1.0)
     angles = [i for i, column in enumerate(kind.columns) if column.dimension is Dimension.ANGLE]
     if len(angles) > 1:
@@ -240,11 +240,11 @@ def _list_signs(kind: Kind) -> Iterator[Slip]:
 
 
 def _list_swaps(kind: Kind) -> Iterator[Slip]:
-    named = _columns_by_name(kind)
-    dimension = {name: kind.columns[columns[0]].dimension for name, columns in named.items()}
-    for d in dict.fromkeys(dimension.values()):
-        alike = {name: columns for name, columns in named.items() if dimension[name] is d}
-        yield from _list_orders(alike, "columns")
+    for named in _list_names(kind):
+        dimension = {name: kind.columns[columns[0]].dimension for name, columns in named.items()}
+        for d in dict.fromkeys(dimension.values()):
+            alike = {name: columns for name, columns in named.items() if dimension[name] is d}
+            yield from _list_orders(alike, "columns")
     yield from _list_orders(dict(kind.target_columns), "targets")
 
 
@@ -266,15 +266,17 @@ def _list_orders(groups: Mapping[str, Sequence[int]], noun: str) -> Iterator[Sli
 RULES = (_list_units, _list_rotations, _list_signs, _list_swaps)
 
 
-def _columns_by_name(kind: Kind) -> dict[str, list[int]]:
-    """Return columns of the same meaning in all targets, by name: x of every target."""
+def _list_names(kind: Kind) -> Iterator[dict[str, list[int]]]:
+    """Yield columns by name: x of every target together, and, of several targets, x of each."""
     named: dict[str, list[int]] = {}
-    single = len(kind.target_columns) == 1
+    several = len(kind.target_columns) > 1
     for places in kind.target_columns.values():
         for place in places:
             name = kind.columns[place].name
-            named.setdefault(name if single else name.rsplit(".", 1)[-1], []).append(place)
-    return named
+            named.setdefault(name.rsplit(".", 1)[-1] if several else name, []).append(place)
+    yield named
+    for places in kind.target_columns.values() if several else ():
+        yield {kind.columns[place].name: [place] for place in places}
 
 
 def _orientation_columns(
