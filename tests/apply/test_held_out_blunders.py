@@ -222,6 +222,17 @@ def test_dominating_blunder_leaves_the_verdict_undecided_and_is_the_next_step(ro
     assert "gates.errors-grew" not in list_codes(report.findings)
 
 
+def test_lost_decimal_point_of_a_fitted_row_is_the_next_step_although_the_fit_fails(
+    robot, data, split
+):
+    label = split[0].labels[3]
+    wild = change(data, lambda values: values * 1e4, data.labels.index(label))
+    report = calibrate(robot, wild, CalibrationOptions(held_out=split[1].labels))
+    assert report.verdict is Verdict.NOT_CALIBRATED
+    assert report.next_step.code == "workflow.next-check-outliers"
+    assert report.next_step.data["poses"] == (f"pose {label}",)
+
+
 def test_small_blunder_is_a_reservation_and_exceeded_limits_fail_with_it(robot, data, split):
     row = data.labels.index(split[1].labels[WRONG])
     wrong = change(data, lambda values: values + 50 * UM * (np.arange(9) == 0), row)

@@ -523,8 +523,10 @@ class CalibrationReport(DeferredFields, TableResult):
 
         level : probability, of all tests of the fitted poses, below which one is listed.
         """
-        wrong = (f.data["poses"] for f in self.findings if f.code in (ALL_POSES, FAR_OFF))
-        labels = [label for poses in wrong for label in poses]
+        named, fitted = {f.code: f.data for f in self.findings}, self.split.fitted.labels
+        labels = [*named[ALL_POSES]["poses"]] if ALL_POSES in named else []
+        if FAR_OFF in named:
+            labels += [label for label in named[FAR_OFF]["poses"] if label in fitted]
         if self.examination is not None:
             check = self.examination.outliers
             clear = (o.poses for o in check.outliers if o.p_value * check.blocks < level)
