@@ -140,6 +140,8 @@ def test_start_values_of_all_sessions_are_sought_together(name, monkeypatch):
     found = guess_nuisance_values_batch(data, [rows.measured[None]], T[None], nuisance)[0]
     assert len(calls) <= 2  # sessions with about as many rows
     assert_allclose(whitened_residuals(data, T, nuisance, found), 0.0, atol=1e-3)
+    none = guess_nuisance_values_batch(data, [rows.measured[None][:0]], T[None], nuisance)
+    assert none.shape == (0, len(found))  # such as readings with which the robot reaches no pose
 
 
 def test_fixed_values_are_kept_and_priors_change_start_values():

@@ -374,7 +374,7 @@ def _read_errors(run: Run, poses: Sequence[str] | None = None) -> PoseErrors:
     stored = run.result.get("validation")
     try:
         validation = stored and restore_validation(stored, run.arrays, run.robot)
-    except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
         problem = "'validation' is not what a calibration writes"
         raise FileError(report_finding("files.run-damaged", problem=problem), run.path) from error
     if not validation:

@@ -162,7 +162,7 @@ def guess_nuisance_values_batch(
     observations = measurements.all_observations
     sets = max((len(m) for m in measured), default=len(T))
     values = np.tile(nuisance.values(), (sets, 1))
-    for groups in _list_groups(measurements, nuisance):
+    for groups in _list_groups(measurements, nuisance) if sets else ():
         rows = observations[groups.number]
         given = (measured[groups.number], T, values[:, groups.parameters])
         refined, cost = _refine_candidates(rows, groups, *given, most, steps)
