@@ -265,10 +265,10 @@ def test_views_contain_every_trial_with_its_factors(result: StudyResult) -> None
 def test_memory_does_not_grow_with_the_number_of_cells(result: StudyResult, tmp_path: Path) -> None:
     study = result.study
     with read_store(result.folder) as store:
-        summarize_study(study, store)  # imports
+        summarize_study(store)  # imports
         tracemalloc.start()
         try:
-            summarize_study(study, store)
+            summarize_study(store)
             _, peak = tracemalloc.get_traced_memory()
         finally:
             tracemalloc.stop()

@@ -5,7 +5,6 @@ they return; a single trial is calibrated again with all checks.
 
 from __future__ import annotations
 
-import json
 import math
 import time
 from collections import Counter, deque
@@ -30,7 +29,7 @@ from loopcal.io.data.measurement_file import format_measurements
 from loopcal.io.robot.robot_file import format_robot
 from loopcal.io.runs.run_folder import RUN, build_document, save_run
 from loopcal.results.tables import Block
-from loopcal.studies.executors import MOST_LOSSES, Executor, Processes, Serial
+from loopcal.studies.executors import MOST_LOSSES, Executor, Processes, Serial, compute_timed
 from loopcal.studies.files.store import StudySource, StudyStore, open_study, read_study
 from loopcal.studies.files.study_file import load_study
 from loopcal.studies.simulation.block import (
@@ -38,13 +37,14 @@ from loopcal.studies.simulation.block import (
     BlockTask,
     PosesTask,
     compute_block,
+    compute_plan,
     compute_task,
     fit_per_leg,
     make_block_task,
     make_poses_task,
     replay_trial,
 )
-from loopcal.studies.simulation.machines import CellPoses, compute_poses, is_planned
+from loopcal.studies.simulation.machines import CellPoses, is_planned
 from loopcal.studies.specification import FACTORS, PER_LEG, Cell, Study, compute_key, describe_cell
 from loopcal.studies.study_result import StudyResult, explain_failures
 from loopcal.typing import Progress, report_no_progress
@@ -276,13 +276,12 @@ def estimate_time(
         content = describe_cell(study, study.cells[number]) | {"block": 0}
         plan = make_poses_task(content)
         if plan.key not in poses:
-            begin = time.perf_counter()
-            poses[plan.key] = compute_poses(json.loads(plan.content))
-            planning += time.perf_counter() - begin
+            poses[plan.key], spent = compute_timed(compute_plan, plan)
+            planning += spent
         task = make_block_task(number, content, poses[plan.key])
-        begin = time.perf_counter()
-        outcomes = compute_block(task)[:, 0]
-        seconds.append(time.perf_counter() - begin)
+        scores, spent = compute_timed(compute_block, task)
+        outcomes = scores[:, 0]
+        seconds.append(spent)
         trials += len(outcomes)
         failures.update(OUTCOMES[int(outcome)] for outcome in outcomes if outcome)
         if sum(seconds) + planning > LONGEST:

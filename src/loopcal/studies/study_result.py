@@ -33,6 +33,7 @@ from loopcal.findings import report_finding
 from loopcal.findings.catalog import find_entry
 from loopcal.io.core.text_file import replace_file, to_json, write_bytes, write_text
 from loopcal.report.words import say
+from loopcal.results.description import Records, Variable
 from loopcal.results.result import TableResult
 from loopcal.results.tables import (
     ABSENT,
@@ -43,13 +44,7 @@ from loopcal.results.tables import (
     format_number,
     word_column,
 )
-from loopcal.studies.files.store import (
-    StudyStore,
-    is_driven,
-    load_specification,
-    read_store,
-    read_study,
-)
+from loopcal.studies.files.store import StudyStore, is_driven, read_store, read_study
 from loopcal.studies.simulation.block import OUTCOMES, STEPS_REMAIN, has_result
 from loopcal.studies.specification import (
     Cell,
@@ -90,7 +85,7 @@ class StudyResult(TableResult):
     def summarize(self) -> StudySummary:
         """Return medians, quantiles and coverage of all cells, with intervals."""
         with read_store(self.folder) as store:
-            return summarize_study(load_specification(store), store)
+            return summarize_study(store)
 
     def answer_questions(self) -> tuple[AnsweredQuestion, ...]:
         """Return the answers to the questions of the study file."""
@@ -138,7 +133,7 @@ class StudyResult(TableResult):
     def _ask(self, question: Question, name: str = "") -> AnsweredQuestion:
         """Return the answers to a question."""
         with read_store(self.folder) as store:
-            return answer_question(load_specification(store), store, question, name)
+            return answer_question(store, question, name)
 
     def read_scores(self, cell: Cell | int, columns: Sequence[str] | None = None) -> FloatArray:
         """Return the scores of the stored trials of a cell: (t, s), SI.
@@ -152,9 +147,8 @@ class StudyResult(TableResult):
         DataError : a score that the study does not have.
         """
         chosen = self.study.cells[cell] if isinstance(cell, int | np.integer) else cell
-        places = find_columns(self.study, columns)
         with read_store(self.folder) as store:
-            return read_trials(self.study, store, chosen, places)[1]
+            return read_trials(store, chosen, columns)[1]
 
     def to_frame(self) -> Any:
         """Return all trials as a pandas DataFrame: factors, trial, and scores in SI.
@@ -166,7 +160,7 @@ class StudyResult(TableResult):
         pandas = import_optional("pandas", "tables", StudyError)
         study = self.study
         with read_store(self.folder) as store:
-            read = [read_trials(study, store, cell) for cell in study.cells]
+            read = [read_trials(store, cell) for cell in study.cells]
         counts = [len(trials) for trials, _ in read]
         factors = {}
         for name, levels in study.levels.items():
@@ -176,32 +170,32 @@ class StudyResult(TableResult):
         columns = {column.name: scores[:, i] for i, column in enumerate(study.columns)}
         return pandas.DataFrame({**factors, "trial": trials, **columns})
 
+    def records(self) -> Records:
+        """Return an array for each score, whose dimensions are the factors and the trial; trials
+        that are not stored are NaN.
+        """
+        study, levels = self.study, {name: list(of) for name, of in self.study.levels.items()}
+        shape = *map(len, levels.values()), study.replicates  # the last factor varies fastest
+        scores = np.full((len(study.columns), len(study.cells), study.replicates), np.nan)
+        with read_store(self.folder) as store:
+            for cell in study.cells:
+                trials, values = read_trials(store, cell)
+                scores[:, cell.number, trials] = values.T
+        variables = tuple(
+            Variable(column.name, (*levels, "trial"), of_score.reshape(shape), column.unit)
+            for column, of_score in zip(study.columns, scores, strict=True)
+        )
+        return Records(variables, {**levels, "trial": range(study.replicates)})
+
     def to_dataset(self) -> Any:
-        """Return all trials as an xarray Dataset: a variable for each score, with its unit, whose
-        dimensions are the factors and the trial, as in `data.position.sel({"poses": "12"})`.
-        Trials that are not stored are NaN.
+        """Return all trials as an xarray Dataset: a variable for each score, with its unit, as in
+        `data.position.sel({"poses": "12"})`; see `records`.
 
         Raises
         ------
-        StudyError : xarray is not installed.
+        MissingPackageError : xarray is not installed.
         """
-        xarray = import_optional("xarray", "tables", StudyError)
-        study, levels = self.study, {name: list(of) for name, of in self.study.levels.items()}
-        shape = tuple(map(len, levels.values()))
-        scores = np.full((len(study.cells), study.replicates, len(study.columns)), np.nan)
-        with read_store(self.folder) as store:
-            for cell in study.cells:
-                trials, values = read_trials(study, store, cell)
-                scores[cell.number, trials] = values
-        scores = scores.reshape(*shape, *scores.shape[1:])  # the last factor varies fastest
-        return xarray.Dataset(
-            {
-                column.name: ((*levels, "trial"), scores[..., i], {"units": column.unit})
-                for i, column in enumerate(study.columns)
-            },
-            coords={**levels, "trial": np.arange(study.replicates)},
-            attrs={"title": study.title},
-        )
+        return super().to_dataset().assign_attrs(title=self.study.title)
 
 
 def find_columns(study: Study, names: Sequence[str] | None = None) -> tuple[int, ...]:
@@ -215,33 +209,24 @@ def find_columns(study: Study, names: Sequence[str] | None = None) -> tuple[int,
     return tuple(range(len(known)) if names is None else (known.index(name) for name in names))
 
 
-def iterate_trials(study: Study, store: StudyStore, cell: Cell) -> Iterator[tuple[int, FloatArray]]:
-    """Yield the first trial and the scores (t, s) of each stored block of a cell.
-
-    Trials beyond the replicates of the study, which fill its last block, are left out.
-    """
-    for block, scores in store.read_blocks(cell.levels):
-        count = study.count_trials(block)
-        if count > 0:
-            yield block * study.block, scores[:count]
-
-
 def read_trials(
-    study: Study, store: StudyStore, cell: Cell, columns: Sequence[int] | None = None
+    store: StudyStore, cell: Cell, names: Sequence[str] | None = None
 ) -> tuple[np.ndarray, FloatArray]:
-    """Return the numbers (t,) and scores (t, s) of the stored trials of a cell.
+    """Return the numbers (t,) of the stored trials of a cell, and their scores (t, s) of these
+    names, all by default.
 
-    Memory is that of the result and of one block.
+    Trials beyond the replicates of the study, which fill its last block, are left out. Memory is
+    that of the result and of one block.
     """
-    places = list(find_columns(study) if columns is None else columns)
+    study, places = store.study, list(find_columns(store.study, names))
     with store.keep_state():
         most = min(store.count_cell(cell.levels).trials, study.replicates)
         numbers, scores, done = np.empty(most, dtype=np.int64), np.empty((most, len(places))), 0
-        for first, block in iterate_trials(study, store, cell):
-            last = done + len(block)
-            numbers[done:last] = np.arange(first, first + len(block))
-            scores[done:last] = block[:, places]
-            done = last
+        for number, block in store.read_blocks(cell.levels):
+            kept = block[: max(study.count_trials(number), 0), places]
+            last = done + len(kept)
+            numbers[done:last] = number * study.block + np.arange(len(kept))
+            scores[done:last], done = kept, last
     return numbers[:done], scores[:done]
 
 
@@ -312,27 +297,28 @@ class StudySummary:
         return all(cell.trials == self.replicates for cell in self.cells)
 
 
-def summarize_study(study: Study, store: StudyStore) -> StudySummary:
+def summarize_study(store: StudyStore) -> StudySummary:
     """Return the summary of the stored trials; memory is bounded by `MEMORY`."""
+    study = store.study
     with store.keep_state():
-        cells = tuple(_summarize_cell(study, store, cell) for cell in study.cells)
+        cells = tuple(_summarize_cell(store, cell) for cell in study.cells)
     trials = sum(cell.trials for cell in cells)
     return StudySummary(study.title, study.seed, study.replicates, trials, cells)
 
 
-def _summarize_cell(study: Study, store: StudyStore, cell: Cell) -> CellSummary:
+def _summarize_cell(store: StudyStore, cell: Cell) -> CellSummary:
     """Return the summary of the stored trials of a cell."""
-    outcome = read_trials(study, store, cell, [0])[1][:, 0].astype(int)
-    is_good, columns = has_result(outcome), study.columns
+    first, *columns = store.study.columns
+    outcome = read_trials(store, cell, [first.name])[1][:, 0].astype(int)
+    is_good = has_result(outcome)
     failed = {OUTCOMES[i]: int((outcome == i).sum()) for i in np.unique(outcome[~is_good])}
     at_once = max(MEMORY // (8 * max(len(outcome), 1)), 1)
     scores: list[ScoreSummary] = []
-    for first in range(1, len(columns), at_once):
-        places = range(first, min(first + at_once, len(columns)))
-        values = read_trials(study, store, cell, places)[1]
-        for j, i in enumerate(places):
-            is_counted = is_good | (BEFORE in columns[i].name)
-            scores.append(summarize_score(columns[i], values[is_counted, j]))
+    for chosen in (columns[i : i + at_once] for i in range(0, len(columns), at_once)):
+        values = read_trials(store, cell, [column.name for column in chosen])[1]
+        for column, of_score in zip(chosen, values.T, strict=True):
+            is_counted = is_good | (BEFORE in column.name)
+            scores.append(summarize_score(column, of_score[is_counted]))
     share = estimate_share((outcome == 0).astype(float))
     kept = tuple(score for score in scores if score.median or score.mean)
     unfinished = int((outcome == STEPS_REMAIN).sum())
@@ -449,7 +435,7 @@ class StudyStatus:
 def read_status(folder: Path) -> StudyStatus:
     """Return the state of the folder of a study, also while it runs."""
     with read_store(folder) as store:
-        study = load_specification(store)
+        study = store.study
         counts = [store.count_cell(cell.levels) for cell in study.cells]
     cells = tuple(
         CellStatus(cell.number, cell.levels, count.blocks, study.blocks, count.seconds)
@@ -489,9 +475,7 @@ def view_status(state: StudyStatus, format_duration: Callable[[float], str]) -> 
     return [*page, build_table("", state.cells, *columns)]
 
 
-def export_trials(
-    study: Study, store: StudyStore, path: Path, progress: Progress = report_no_progress
-) -> int:
+def export_trials(store: StudyStore, path: Path, progress: Progress = report_no_progress) -> int:
     """Write all stored trials as one table, and return their number.
 
     Columns are all factors, the trial, and the scores in SI. A CSV file has their units in its
@@ -505,11 +489,11 @@ def export_trials(
     ending = path.suffix.lower()
     if ending not in (".csv", ".parquet"):
         raise DataError(f"{path} must end in .csv or .parquet, which decides its format")
-    begin, count = _begin_csv if ending == ".csv" else _begin_parquet, 0
+    begin, study, count = _begin_csv if ending == ".csv" else _begin_parquet, store.study, 0
     with replace_file(path) as temporary, store.keep_state(), begin(study, temporary) as write:
         for cell in study.cells:
             progress(cell.number, len(study.cells), "writing trials")
-            trials, scores = read_trials(study, store, cell)
+            trials, scores = read_trials(store, cell)
             if len(trials):
                 write(list(cell.levels.values()), trials, scores)
             count += len(trials)
@@ -633,15 +617,13 @@ class AnsweredQuestion:
         return "\n".join(lines)
 
 
-def answer_question(
-    study: Study, store: StudyStore, question: Question, name: str = ""
-) -> AnsweredQuestion:
+def answer_question(store: StudyStore, question: Question, name: str = "") -> AnsweredQuestion:
     """Return the answers of the stored trials, one for each combination of the other factors.
 
     Raises DataError: see `check_question`.
     """
-    limit, factor = check_question(study, question), question.factor
-    chains = list_chains(study, factor)
+    study, factor = store.study, question.factor
+    limit, chains = check_question(study, question), list_chains(study, factor)
     (place,) = find_columns(study, [question.score])
     varied = [other for other in study.varied_factors if other != factor]
     groups: dict[tuple[str, ...], dict[str, Cell]] = {}
@@ -652,7 +634,7 @@ def answer_question(
     with store.keep_state():
         for others, cells in groups.items():
             counts = {
-                level: _count_reached(study, store, cell, place, limit)
+                level: _count_reached(store, cell, question.score, limit)
                 for level, cell in cells.items()
             }
             for chain in chains:
@@ -706,19 +688,14 @@ def decide(
     return certainty, tuple(candidates), not is_reached, states
 
 
-def _count_reached(
-    study: Study, store: StudyStore, cell: Cell, place: int, limit: float
-) -> tuple[int, int]:
+def _count_reached(store: StudyStore, cell: Cell, score: str, limit: float) -> tuple[int, int]:
     """Return how many trials of a cell have a score up to the limit, and all trials; none where no
     trial with a result has the score, such as a rotation error of a platform that only moves.
     """
-    reached = trials = counted = defined = 0
-    for _, scores in iterate_trials(study, store, cell):
-        values = scores[has_result(scores[:, 0]), place]
-        reached += int((values <= limit).sum())
-        defined += int((~np.isnan(values)).sum())
-        trials, counted = trials + len(scores), counted + len(values)
-    return (0, 0) if counted and not defined else (reached, trials)
+    outcome, scores = read_trials(store, cell, [store.study.columns[0].name, score])[1].T
+    values = scores[has_result(outcome)]
+    is_undefined = len(values) > 0 and np.isnan(values).all()
+    return (0, 0) if is_undefined else (int((values <= limit).sum()), len(scores))
 
 
 # SI symbol of a score -> unit of its limit on the screen.

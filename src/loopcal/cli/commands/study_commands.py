@@ -349,12 +349,12 @@ def export(
       loopcal study export results -o trials.parquet
     """
     from loopcal.io.core.outputs import refuse_outputs
-    from loopcal.studies.files.store import load_specification, read_store
+    from loopcal.studies.files.store import read_store
     from loopcal.studies.study_result import export_trials
 
     refuse_outputs((output,), (), force)
     with read_store(folder) as store, terminal.TerminalProgress() as progress:
-        count = export_trials(load_specification(store), store, output, progress)
+        count = export_trials(store, output, progress)
     document = {"written": str(output), "trials": count}
     return Output(document, lambda: [f"Written: {output} ({count} trials)"])
 

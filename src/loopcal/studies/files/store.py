@@ -171,6 +171,11 @@ class StudyStore:
             raise FileError(report_finding("store.damaged"), self.path) from None
 
     @cached_property
+    def study(self) -> Study:
+        """Its study, see `load_specification`."""
+        return load_specification(self)
+
+    @cached_property
     def width(self) -> int:
         """Number of columns."""
         return len(self.header.columns)
@@ -540,7 +545,7 @@ def open_study(folder: Path, source: StudySource, resume: bool = False) -> Itera
 def read_study(folder: Path) -> Study:
     """Return the study of a folder."""
     with read_store(folder) as store:
-        return load_specification(store)
+        return store.study
 
 
 def load_specification(store: StudyStore) -> Study:
@@ -631,6 +636,6 @@ def merge_studies(
         for i, part in enumerate(part_folders):
             progress(i, len(part_folders), "joining folders")
             with read_store(part) as other:
-                for cell in load_specification(other).cells:
+                for cell in other.study.cells:
                     count += store.copy_blocks(other, cell.levels)
     return count

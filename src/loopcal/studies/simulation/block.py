@@ -442,9 +442,12 @@ def compute_block(task: BlockTask, threads: int = 1) -> FloatArray:
 
 def compute_task(task: BlockTask | PosesTask, threads: int = 1) -> FloatArray | CellPoses:
     """Compute a block, see `compute_block`, or poses."""
-    if isinstance(task, PosesTask):
-        return compute_poses(json.loads(task.content))
-    return compute_block(task, threads)
+    return compute_plan(task) if isinstance(task, PosesTask) else compute_block(task, threads)
+
+
+def compute_plan(task: PosesTask) -> CellPoses:
+    """Draw or plan poses."""
+    return compute_poses(json.loads(task.content))
 
 
 def make_poses_task(content: Mapping[str, Any]) -> PosesTask:
@@ -469,7 +472,7 @@ def list_tasks(
     for number in range(len(study.cells)) if cells is None else cells:
         of_cell = describe_cell(study, study.cells[number])
         task = make_poses_task(of_cell)
-        poses = known.get(task.key) or compute_poses(json.loads(task.content))
+        poses = known.get(task.key) or compute_plan(task)
         known[task.key] = poses
         for block in range(study.blocks) if blocks is None else blocks:
             yield make_block_task(number, of_cell | {"block": block}, poses)
