@@ -3,8 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any, ClassVar, NamedTuple
 
@@ -137,9 +137,11 @@ class SlotMap:
         for places, columns, coefficients in self._layers:
             slots[:, places] += change[:, columns] * coefficients
         for (shared, inputs, outputs), nominal in zip(
-            self.shared, self._shared_nominal, strict=True
+            self._together, self._shared_nominal, strict=True
         ):
-            slots[:, outputs] += shared.value(values[:, inputs]) - nominal
+            change = _spread(shared.value, values, inputs) - nominal
+            for i, own in enumerate(outputs):
+                slots[:, own] += change[:, i]
         e, tau = slots[:, : self.n_displacements], slots[:, self.n_displacements :]
         return e, self.terms + tau.reshape(-1, *self.terms.shape)
 
@@ -155,9 +157,23 @@ class SlotMap:
         ]
 
     @cached_property
+    def _together(self) -> list[tuple[SharedMap, IntArray, IntArray]]:
+        """Shared maps, those that differ in names alone as one, with the positions (m, i) of the
+        inputs and (m, o) of the outputs of its m maps.
+        """
+        groups: dict[Any, tuple[SharedMap, list[tuple[int, ...]], list[tuple[int, ...]]]] = {}
+        for shared, *places in self.shared:
+            key = type(shared) if len(vars(shared)) == len(fields(SharedMap)) else id(shared)
+            group = groups.setdefault(key, (shared, [], []))
+            for own, new in zip(group[1:], places, strict=True):
+                own.append(new)
+        return [(shared, np.array(i), np.array(o)) for shared, i, o in groups.values()]
+
+    @cached_property
     def _shared_nominal(self) -> list[FloatArray]:
-        """Values (1, outputs) of the shared maps at the nominal parameters."""
-        return [shared.value(self.nominal[None, inputs]) for shared, inputs, _ in self.shared]
+        """Values (1, m, outputs) of the shared maps at the nominal parameters."""
+        at = self.nominal[None]
+        return [_spread(shared.value, at, inputs) for shared, inputs, _ in self._together]
 
     @cached_property
     def touches(self) -> BoolArray:
@@ -205,11 +221,19 @@ class SlotMap:
     def jacobian(self, values: FloatArray) -> FloatArray:
         """Return d slots / d values, (t, s, p)."""
         J = np.repeat(self.matrix[None], len(values), axis=0)
-        for shared, inputs, outputs in self.shared:
-            slopes = shared.jacobian(values[:, inputs])
-            for i, column in enumerate(inputs):
-                J[:, outputs, column] += slopes[:, :, i]
+        for shared, inputs, outputs in self._together:
+            slopes = _spread(shared.jacobian, values, inputs)
+            for i, own in enumerate(outputs):
+                J[:, own[:, None], inputs[i]] += slopes[:, i]
         return J
+
+
+def _spread(
+    function: Callable[[FloatArray], FloatArray], values: FloatArray, inputs: IntArray
+) -> FloatArray:
+    """Return a function (t m, i) -> (t m, ..) of inputs at places (m, i) of values, (t, m, ..)."""
+    result = function(values[:, inputs].reshape(-1, inputs.shape[1]))
+    return result.reshape(len(values), len(inputs), *result.shape[1:])
 
 
 @dataclass(frozen=True, eq=False)
