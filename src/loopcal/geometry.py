@@ -582,6 +582,7 @@ FLATNESS = 1e-6  # ratio of extents [1] below which points count as coplanar, or
 # Change of a rotation [rad] that ends `solve_directions` and `minimize_over_rotations`; a descent
 # refines the result anyway.
 ROTATION_CHANGE = 1e-6
+MEETING = 0.02  # angle [rad] between two starts from which one of them stands for both
 
 NEWTON_STEPS, FLATTEST, ROUNDING = 40, 1e-9, 1e-15
 """Steps of Newton's method on rotations, of which a dozen are usual; the curvature, as a share of
@@ -624,8 +625,9 @@ def minimize_over_rotations(H: FloatArray, g: FloatArray, count: int = 3) -> lis
 
     The vector v holds the nine entries of R row by row. Newton's method on the rotation group, with
     the absolute curvatures and a radius that a failed step quarters, begins at the rotation nearest
-    to the unconstrained minimum and at the 24 rotations of a cube. Near a minimum it converges
-    quadratically however large the residual is, where Gauss-Newton does not.
+    to the unconstrained minimum and at the 24 rotations of a cube. Of starts that meet, one goes
+    on. Near a minimum it converges quadratically however large the residual is, where Gauss-Newton
+    does not.
     """
     free = (np.linalg.pinv(H, rcond=ALIGNMENT_TOLERANCE) @ g[..., None]).reshape(-1, 1, 3, 3)
     cube = np.broadcast_to(OCTAHEDRAL_ROTATIONS, (len(H), *OCTAHEDRAL_ROTATIONS.shape))
@@ -634,7 +636,8 @@ def minimize_over_rotations(H: FloatArray, g: FloatArray, count: int = 3) -> lis
     size = np.maximum(np.trace(H, axis1=1, axis2=2), TINY)[:, None]
     H, g = H / size[..., None], g / size  # values and curvatures of order one
     value = _evaluate_form(H[of], g[of], R)
-    radius, active = np.ones(len(R)), np.arange(len(R))
+    radius, active, order = np.ones(len(R)), np.arange(len(R)), np.arange(len(R) // len(H))
+    goes_on = np.ones((len(H), len(order)), dtype=bool)
     for _ in range(NEWTON_STEPS):
         if not active.size:
             break
@@ -647,9 +650,12 @@ def minimize_over_rotations(H: FloatArray, g: FloatArray, count: int = 3) -> lis
         better = new_value < value[active] + ROUNDING
         R[active[better]], value[active[better]] = moved[better], new_value[better]
         radius[active] = np.where(better, np.minimum(1.0, 2.0 * radius[active]), 0.25 * longest)
-        active = active[longest > ROTATION_CHANGE]
-    ends = zip(np.split(R, len(H)), np.split(value, len(H)), strict=True)
-    return [_select_distinct(each[np.argsort(of_each)], count) for each, of_each in ends]
+        entries = R.reshape(len(H), -1, 9)
+        meets = entries @ np.swapaxes(entries, 1, 2) >= 3.0 - MEETING**2  # 1 + 2 cos(angle)
+        goes_on &= np.argmax(meets & goes_on[:, None], axis=2) == order
+        active = active[(longest > ROTATION_CHANGE) & goes_on.ravel()[active]]
+    ends = zip(np.split(R, len(H)), np.split(value, len(H)), goes_on, strict=True)
+    return [_select_distinct(r[on][np.argsort(v[on])], count) for r, v, on in ends]
 
 
 def _evaluate_form(H: FloatArray, g: FloatArray, R: FloatArray) -> FloatArray:

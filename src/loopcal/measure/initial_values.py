@@ -24,7 +24,7 @@ from loopcal.measure.measurements import Measurements
 from loopcal.measure.nuisance import NuisanceParameters
 from loopcal.measure.observations import Observations, whiten_columns
 from loopcal.numerics.elimination import find_connected_groups
-from loopcal.numerics.gauss_newton import STEPS, minimize_from_starts, sum_squares
+from loopcal.numerics.gauss_newton import GOOD_START, STEPS, minimize_from_starts, sum_squares
 from loopcal.numerics.statistics import choose_evenly, find_distinct
 from loopcal.parameters import ParameterTable
 from loopcal.typing import BoolArray, FloatArray, IntArray
@@ -344,7 +344,9 @@ def _refine_candidates(
         cost = sum_squares(whiten(candidates, sets)[0]).reshape(t * g, k)
         chosen = (np.argsort(cost, axis=1)[:, :most] + k * np.arange(t * g)[:, None]).ravel()
         candidates, sets, k = candidates[chosen], sets[chosen], most
-    refined, cost = minimize_from_starts(lambda x, which: whiten(x, sets[which]), candidates, steps)
+    refined, cost = minimize_from_starts(
+        lambda x, which: whiten(x, sets[which]), candidates, steps, GOOD_START
+    )
     names = [parameter.name for parameter in kind.nuisance_parameters]
     shortest = shorten_rotations(names, refined)
     is_same = ((shortest == refined) | ~kept).all(axis=1, keepdims=True)
@@ -362,7 +364,7 @@ def _collect_candidates(
     for guesses in own.guess_sets(poses, measured, is_row):
         if not isinstance(guesses, DataError):
             shared = len(kind.nominal_values) - guesses.shape[1]  # a bias or drift begins at zero
-            candidates = np.pad(guesses, ((0, 0), (0, shared)))
+            candidates = np.concatenate([guesses, np.zeros((len(guesses), shared))], axis=1)
         elif is_strict:
             raise guesses
         else:

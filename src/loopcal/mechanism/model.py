@@ -139,9 +139,7 @@ class SlotMap:
         for (shared, inputs, outputs), nominal in zip(
             self._together, self._shared_nominal, strict=True
         ):
-            change = _spread(shared.value, values, inputs) - nominal
-            for i, own in enumerate(outputs):
-                slots[:, own] += change[:, i]
+            slots[:, outputs] += _spread(shared.value, values, inputs) - nominal
         e, tau = slots[:, : self.n_displacements], slots[:, self.n_displacements :]
         return e, self.terms + tau.reshape(-1, *self.terms.shape)
 
@@ -159,14 +157,17 @@ class SlotMap:
     @cached_property
     def _together(self) -> list[tuple[SharedMap, IntArray, IntArray]]:
         """Shared maps, those that differ in names alone as one, with the positions (m, i) of the
-        inputs and (m, o) of the outputs of its m maps.
+        inputs and (m, o) of the outputs of its m maps, each output once.
         """
         groups: dict[Any, tuple[SharedMap, list[tuple[int, ...]], list[tuple[int, ...]]]] = {}
-        for shared, *places in self.shared:
-            key = type(shared) if len(vars(shared)) == len(fields(SharedMap)) else id(shared)
-            group = groups.setdefault(key, (shared, [], []))
-            for own, new in zip(group[1:], places, strict=True):
-                own.append(new)
+        listed = [place for *_, outputs in self.shared for place in outputs]
+        is_apart = len(set(listed)) == len(listed)
+        for shared, inputs, outputs in self.shared:
+            is_plain = is_apart and len(vars(shared)) == len(fields(SharedMap))
+            key = type(shared) if is_plain else id(shared)
+            _, of_inputs, of_outputs = groups.setdefault(key, (shared, [], []))
+            of_inputs.append(inputs)
+            of_outputs.append(outputs)
         return [(shared, np.array(i), np.array(o)) for shared, i, o in groups.values()]
 
     @cached_property
@@ -222,9 +223,7 @@ class SlotMap:
         """Return d slots / d values, (t, s, p)."""
         J = np.repeat(self.matrix[None], len(values), axis=0)
         for shared, inputs, outputs in self._together:
-            slopes = _spread(shared.jacobian, values, inputs)
-            for i, own in enumerate(outputs):
-                J[:, own[:, None], inputs[i]] += slopes[:, i]
+            J[:, outputs[:, :, None], inputs[:, None]] += _spread(shared.jacobian, values, inputs)
         return J
 
 

@@ -123,8 +123,9 @@ STEPS = 60  # steps of damped Gauss-Newton [1]; starts in the right basin need f
 FIRST_DAMPING, LARGEST_DAMPING = 1e-4, 1e4
 """Damping of the first step [1], in columns of length one, and that at which a descent ends."""
 
-# Step, in standard deviations or as a share of the residuals, that is as good as none.
-NEGLIGIBLE_STEP = 1e-6
+# Step, in standard deviations or as a share of the residuals, that is as good as none; and one that
+# is short enough at the start of another descent: of shorter ones, rounding of the sums decides.
+NEGLIGIBLE_STEP, GOOD_START = 1e-6, 1e-4
 SMALLEST = 1e-12  # singular value of columns of length one that counts as zero
 
 Linearize = Callable[[FloatArray, IntArray], tuple[FloatArray, FloatArray]]
@@ -133,12 +134,13 @@ standard deviation or of order one, and their Jacobians (c, M, u)."""
 
 
 def minimize_from_starts(
-    linearize: Linearize, x: FloatArray, steps: int = STEPS
+    linearize: Linearize, x: FloatArray, steps: int = STEPS, negligible: float = NEGLIGIBLE_STEP
 ) -> tuple[FloatArray, FloatArray]:
     """Minimize sums of squares from starts x (c, u) at once, by damped Gauss-Newton; return the
     ends and the sums of squares (c,), infinite where a start cannot be evaluated.
 
-    A start ends where a step moves the residuals by a millionth of their sigma, or of themselves.
+    A start ends where a step moves the residuals by a `negligible` share of their sigma, or of
+    themselves.
     """
     x = np.array(x)
     residual, jacobian = map(np.array, linearize(x, np.arange(len(x))))
@@ -151,7 +153,7 @@ def minimize_from_starts(
         moved = x[active] + step
         new_residual, new_jacobian = linearize(moved, active)
         new_cost = sum_squares(new_residual)
-        is_small = length <= NEGLIGIBLE_STEP * (1.0 + np.sqrt(new_cost))
+        is_small = length <= negligible * (1.0 + np.sqrt(new_cost))
         goes_on = ~is_small & (damping[active] <= LARGEST_DAMPING)
         better = new_cost < cost[active]
         damping[active] *= np.where(better, 0.1, 10.0)
