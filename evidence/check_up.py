@@ -110,7 +110,7 @@ def collect() -> dict[str, Any]:
                     100.0 * found[:, 1].sum() / max(found[:, 0].sum(), 1),
                 ]
             power.append(row)
-    columns = ["robot", "change [tolerances]"]
+    columns = ["robot", "change [spreads]"]
     columns += [
         f"{how}: {what} [%]" for how in ("planned", "random") for what in ("found", "named")
     ]

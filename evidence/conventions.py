@@ -315,7 +315,7 @@ def collect() -> dict:
     """Collect false alarms, detections and verdicts on random numbers."""
     alarms = {
         "columns": [
-            "errors [tolerances]",
+            "errors [spreads]",
             "correct data sets",
             "too few rows",
             "median misfit",

@@ -64,7 +64,7 @@ def evaluate_deviation(
     """Return median errors [m] at held-out poses, the share of fits that report the conflict, and
     the share of parameters that their intervals contain, with MAP and by default.
 
-    One parameter, another one in each machine, is `size` tolerances off; or all lengths of the
+    One parameter, another one in each machine, is `size` spreads off; or all lengths of the
     limbs are.
     """
     robot = load_robot(name)
@@ -126,7 +126,7 @@ def _collect_deviations() -> dict:
     columns = [
         "robot",
         "off",
-        "by tolerances",
+        "by spreads",
         "least squares [um]",
         "MAP [um]",
         "default [um]",
@@ -168,7 +168,7 @@ def collect() -> dict:
             )
     columns = [
         "robot",
-        "tolerances too small by a factor of",
+        "spreads too small by a factor of",
         "least squares [um]",
         "MAP [um]",
         "default [um]",

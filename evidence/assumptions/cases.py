@@ -117,14 +117,14 @@ def list_cases() -> tuple[Case, ...]:
         Case("AR(1) noise, 0.9", TIME, correlation=0.9),
         *(Case(f"noise {k} times sigma", NOISE, noise=k) for k in (1.15, 1.3, 2.0)),
         *(
-            Case(f"errors {k} times the tolerances", PRIOR, tolerance=k, is_coarse=True)
+            Case(f"errors {k} times the spreads", PRIOR, tolerance=k, is_coarse=True)
             for k in (1.2, 1.4, 1.7, 3.0)
         ),
         *(
-            Case(f"one parameter {k} tolerances off", PRIOR, single=k, is_coarse=True)
+            Case(f"one parameter {k} spreads off", PRIOR, single=k, is_coarse=True)
             for k in (5.0, 10.0, 20.0)
         ),
-        *(Case(f"a batch {k} tolerances off", PRIOR, group=k, is_coarse=True) for k in (4.0, 6.0)),
+        *(Case(f"a batch {k} spreads off", PRIOR, group=k, is_coarse=True) for k in (4.0, 6.0)),
         Case("5 % of the poses 20 sigma off", (*OUTLIERS, *NOISE), outliers=0.05),
         Case("noise of Student's t, 3 degrees", (*OUTLIERS, *NOISE, TAILS), degrees=3.0),
         Case("smooth model error of 15 um", POSE, smooth=SMOOTH_ERROR),

@@ -297,9 +297,11 @@ def test_missing_controller_file_is_refused(run_refused) -> None:
 
 @pytest.mark.parametrize("number", [LengthTolerance(sd=-2.9e-5), LengthTolerance(limits=-2.9e-5)])
 def test_invalid_tolerance_or_workspace_is_reported_with_its_unit(number) -> None:
-    with pytest.raises(lc.MechanismError, match=r"the tolerance of base is -2.9e-05 m, but must"):
+    with pytest.raises(
+        lc.MechanismError, match=r"the expected spread of base is -2.9e-05 m, but must"
+    ):
         standard_deviation(number, "base")
-    with pytest.raises(lc.MechanismError, match=r"the tolerance of tilt is 0 rad, but must"):
+    with pytest.raises(lc.MechanismError, match=r"the expected spread of tilt is 0 rad, but must"):
         standard_deviation(AngleTolerance(sd=0.0), "tilt")
     with pytest.raises(
         lc.MechanismError, match=r"the workspace of z runs from 0.3 m to 0.2 m; the first"

@@ -326,7 +326,7 @@ def test_heights_of_the_wrong_sign_or_unit_are_named() -> None:
 
 
 def test_far_machines_are_not_refused_and_their_mistakes_are_named() -> None:
-    """Ten tolerances off: correct data pass; with a mistake the message says what remains."""
+    """Ten spreads off: correct data pass; with a mistake the message says what remains."""
     for name in ("hexapod-42", "3-prs", "rotary-delta"):
         data = simulate_data(name, Position(), times=10.0, seed=3)
         robot = load_cached_robot(name)

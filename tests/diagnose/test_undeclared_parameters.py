@@ -88,7 +88,7 @@ def test_readings_of_the_other_direction_from_another_zero_are_named(name, colum
 
 
 def test_small_error_of_a_zero_is_left_to_the_calibration() -> None:
-    """An end stop that is ten tolerances off: a first calibration must not be refused."""
+    """An end stop that is ten spreads off: a first calibration must not be refused."""
     data = simulate_data("linear-delta", Position(), 20)
     shifted = change_readings(data, lambda q: q.__setitem__((slice(None), 0), q[:, 0] + 0.005))
     assert not compare_conventions(load_cached_robot("linear-delta"), shifted).is_refused

@@ -160,8 +160,11 @@ def test_names_of_common_errors_differ(tmp_path: Path) -> None:
     ("entry", "complaint"),
     [
         ("{name: rods, of: [rod*], length: {sd: 0.6}}", "matches no parameter"),
-        ("{name: rods, of: [arm*.length]}", "has 0 tolerances"),
-        ("{name: rods, of: [arm*.length], length: {sd: 1}, angle: {sd: 1}}", "has 2 tolerances"),
+        ("{name: rods, of: [arm*.length]}", "has 0 expected spreads"),
+        (
+            "{name: rods, of: [arm*.length], length: {sd: 1}, angle: {sd: 1}}",
+            "has 2 expected spreads",
+        ),
         ("{name: rods, of: [arm*.length], angle: {sd: 0.6}}", "Use the key `length`"),
         ("{name: rods, of: [arm1.length], length: {sd: 0.6}}", "arm1.length alone"),
         ("{name: rods, of: [arm*.length], length: {sd: -1}}", "greater than zero"),

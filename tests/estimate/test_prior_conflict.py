@@ -234,7 +234,7 @@ def test_a_single_wrong_nominal_value_is_named(size):
 
 
 def move_parameter(name: str, size: float):
-    """Return a hexapod, and data of a machine one parameter of which is `size` tolerances off."""
+    """Return a hexapod, and data of a machine one parameter of which is `size` spreads off."""
     robot = hexapod()
     truth = sample_truth(robot, 1, 4)
     i = robot.parameters.index(name)

@@ -140,13 +140,13 @@ class PosesLevel(Limited):
 
 @dataclass(frozen=True)
 class ErrorsLevel(Limited):
-    """The errors of the true machines, and their tolerances in the fit.
+    """The errors of the true machines, and their expected spreads in the fit.
 
-    tolerance_factor : on the tolerances, which the fit knows.
-    error_factor : true errors over tolerances, which the fit does not know.
-    distribution : of the errors. A tolerance is their standard deviation in both. Uniform errors
+    tolerance_factor : on the expected spreads, which the fit knows.
+    error_factor : true errors over expected spreads, which the fit does not know.
+    distribution : of the errors. The spread is their standard deviation. Uniform errors
         lie within sqrt(3) of it.
-    smallest : smallest size of a uniform error as a share of its largest (the tolerance stays its
+    smallest : smallest size of a uniform error as a share of its largest (the spread stays its
         standard deviation).
     tolerances : other tolerances by name of a parameter or by pattern, such as `leg*.length`.
     deviations : equal true deviations from nominal in all trials, by name or pattern. Other

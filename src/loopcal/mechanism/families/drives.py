@@ -109,9 +109,9 @@ class DriveRecord(RowRecord):
     joint value = offset + scale * reading + curve * (reading / reach)^2 + harmonics of the period +
     backlash * direction / 2 + compliance * load + table, where reach is the end of the stroke that
     is farther from zero, and the load is the force [N] that lengthens the drive, or the moment [Nm]
-    of a rotary one. Unknown terms have the tolerance `length` or `angle`, the compliance has
-    `compliances`. Between the rows [reading, value] of the `table` are straight lines or splines
-    (`interpolation`); its unknown values are table1, table2, .., or table for all.
+    of a rotary one. Unknown terms have the expected spread `length` or `angle`, the compliance
+    has `compliances`. Between the rows [reading, value] of the `table` are straight lines or
+    splines (`interpolation`); its unknown values are table1, table2, .., or table for all.
     """
 
     READING: ClassVar[Dimension] = Dimension.LENGTH
@@ -135,7 +135,7 @@ class DriveRecord(RowRecord):
 
 @dataclass(frozen=True, kw_only=True)
 class GivesLength(DriveRecord):
-    """The tolerances of a drive that gives a length."""
+    """The expected spreads of a drive that gives a length."""
 
     length: LengthTolerance | None = None
     compliances: LengthTolerance | None = None
@@ -143,7 +143,7 @@ class GivesLength(DriveRecord):
 
 @dataclass(frozen=True, kw_only=True)
 class Gain:
-    """The scale of a drive whose reading has the unit of its joint, with its tolerance `ratio`."""
+    """The scale of a drive whose reading has the unit of its joint, with its spread `ratio`."""
 
     gain: Ratio = 1.0
     ratio: RatioTolerance | None = None
@@ -153,7 +153,7 @@ class Gain:
 class Sum:
     """What several joints give together: with a `sum`, the name of a driven joint -> weight, the
     transmission gives the sum of weight * joint value; unknown weights (weight.m, or weight for
-    all) have the tolerance `weights`.
+    all) have the expected spread `weights`.
     """
 
     sum: Mapping[str, Ratio] = field(default_factory=dict)
@@ -163,7 +163,7 @@ class Sum:
 @dataclass(frozen=True, kw_only=True)
 class Radii:
     """Rotary joints in a sum of lengths: `radius`, joint -> length per radian. Unknown radii have
-    the tolerance `radii`.
+    the expected spread `radii`.
     """
 
     radius: Mapping[str, Length] = field(default_factory=dict)
@@ -195,8 +195,8 @@ class SpoolDrive(Sum, GivesLength):
 
     joint value = offset + radius * reading + buildup * reading^2 / (4 pi) + .. `radius` is the
     length paid out per radian of the reading (spool radius with gears and tackle), negative if a
-    growing reading shortens; `buildup` is its growth in one turn of the reading. Their tolerances
-    are `radii` and `buildups`.
+    growing reading shortens; `buildup` is its growth in one turn of the reading. Their expected
+    spreads are `radii` and `buildups`.
     """
 
     READING: ClassVar[Dimension] = Dimension.ANGLE
@@ -211,7 +211,7 @@ class SpoolDrive(Sum, GivesLength):
 @dataclass(frozen=True, kw_only=True)
 class ScrewDrive(Radii, Sum, GivesLength):
     """A screw whose reading is its angle: it moves by `lead` in one turn, negative for a left-hand
-    one, with the tolerance `leads`.
+    one, with the expected spread `leads`.
     """
 
     READING: ClassVar[Dimension] = Dimension.ANGLE
@@ -226,8 +226,8 @@ class TriangleDrive(Gain, GivesLength):
     """A linear actuator that turns a revolute joint through two anchors.
 
     The distance of the anchors is what a length drive gives. `unknown` may also name dimensions of
-    the triangle (foot.x, head.z, skew.rx; or foot, head and skew for all of one), with the
-    tolerances `length` and `angle`.
+    the triangle (foot.x, head.z, skew.rx; or foot, head and skew for all of one). Their
+    expected spreads are `length` and `angle`.
     """
 
     reads: Literal["length"] = "length"
@@ -305,7 +305,7 @@ class AngleCoupling(CouplingRecord):
 @dataclass(frozen=True, kw_only=True)
 class LengthCoupling(Radii, CouplingRecord):
     """A coupling of slides, and of rotary joints by a `radius` (joint -> length per radian), as of
-    a pinion on a rack. Unknown radii have the tolerance `radii`.
+    a pinion on a rack. Unknown radii have the expected spread `radii`.
     """
 
     of: Literal["length"]
@@ -822,7 +822,7 @@ def _check_drive(placed: PlacedRow, drive: Drive) -> None:
         raise drive.refuse(name, "has a negative compliance. Give its size")
     if "compliance" in drive.unknown and drive.compliances is None:
         sentence = (
-            "has an unknown compliance. Give `compliances:`, the tolerance of its given value"
+            "has an unknown compliance. Give `compliances:`, the expected spread of its given value"
         )
         raise drive.refuse(name, sentence)
     if drive.table:

@@ -131,7 +131,7 @@ def _normalize(vector: ArrayLike, refusal: str) -> tuple[FloatArray, float]:
 
 @dataclass(frozen=True)
 class GoughTolerances:
-    """Tolerances of joint centers on base and platform and of leg lengths.
+    """Expected spreads of joint centers on base and platform and of leg lengths.
 
     `links` and `angles` are those of the complete model.
     """

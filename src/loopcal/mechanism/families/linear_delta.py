@@ -38,7 +38,7 @@ from loopcal.units import Angle, Dimension, Length
 
 @dataclass(frozen=True)
 class DeltaTolerances:
-    """Tolerances of the delta's parameters."""
+    """Expected spreads of the delta's parameters."""
 
     radius: LengthTolerance | None = None
     angles: AngleTolerance | None = None

@@ -397,7 +397,7 @@ class PoseRecord:
 
 @dataclass(frozen=True)
 class ToleranceRecord:
-    """Tolerance of a number: sd, or limits of a uniform error (sd = limits / sqrt 3)."""
+    """Expected spread of a number: sd, or limits of a uniform error (sd = limits / sqrt 3)."""
 
     GIVEN: ClassVar[Dimension] = Dimension.RATIO
 
@@ -407,34 +407,36 @@ class ToleranceRecord:
 
 @dataclass(frozen=True)
 class LengthTolerance(ToleranceRecord):
-    """Tolerance of a length: sd, or limits of a uniform error (sd = limits / sqrt 3)."""
+    """Expected spread of a length: sd, or limits of a uniform error (sd = limits / sqrt 3)."""
 
     GIVEN: ClassVar[Dimension] = Dimension.LENGTH
 
 
 @dataclass(frozen=True)
 class AngleTolerance(ToleranceRecord):
-    """Tolerance of an angle: sd, or limits of a uniform error (sd = limits / sqrt 3)."""
+    """Expected spread of an angle: sd, or limits of a uniform error (sd = limits / sqrt 3)."""
 
     GIVEN: ClassVar[Dimension] = Dimension.ANGLE
 
 
 @dataclass(frozen=True)
 class RatioTolerance(ToleranceRecord):
-    """Tolerance of a ratio: sd, or limits of a uniform error (sd = limits / sqrt 3)."""
+    """Expected spread of a ratio: sd, or limits of a uniform error (sd = limits / sqrt 3)."""
 
 
 def standard_deviation(tolerance: ToleranceRecord | None, name: str) -> float | None:
-    """Return the standard deviation of a tolerance [SI], None without; MechanismError if wrong."""
+    """Return the standard deviation of a spread [SI], None without; MechanismError if wrong."""
     if tolerance is None:
         return None
     if (tolerance.sd is None) == (tolerance.limits is None):
-        raise MechanismError(f"the tolerance of {name} must give exactly one of sd and limits")
+        raise MechanismError(
+            f"the expected spread of {name} must give exactly one of sd and limits"
+        )
     stated = tolerance.sd if tolerance.sd is not None else tolerance.limits or 0.0
     if not is_sd(stated):
         unit = {Dimension.LENGTH: " m", Dimension.ANGLE: " rad"}.get(tolerance.GIVEN, "")
         raise MechanismError(
-            f"the tolerance of {name} is {stated:g}{unit}, but must be greater than zero "
+            f"the expected spread of {name} is {stated:g}{unit}, but must be greater than zero "
             f"({SD_RANGE}), or left out"
         )
     return float(stated if tolerance.sd is not None else stated / np.sqrt(3.0))
@@ -442,7 +444,7 @@ def standard_deviation(tolerance: ToleranceRecord | None, name: str) -> float | 
 
 @dataclass(frozen=True)
 class LinkTolerances:
-    """Tolerances of all lengths and of all angles."""
+    """Expected spreads of all lengths and of all angles."""
 
     lengths: LengthTolerance | None = None
     angles: AngleTolerance | None = None

@@ -218,7 +218,7 @@ class CommonErrorRecord:
     """An error that several parameters share in addition to their own, such as one batch.
 
     name : of the common error. of : the parameters, by name or pattern, such as `arm*.length`.
-    length, angle, ratio : the tolerance of the common error, by the dimension of the parameters.
+    length, angle, ratio : its expected spread, by the dimension of the parameters.
     """
 
     name: str
@@ -240,7 +240,7 @@ class CommonErrorRecord:
         stated = {d: t for d in Dimension if (t := getattr(self, d.value, None)) is not None}
         if len(stated) != 1:
             example = "Give one, such as `length: {sd: 0.1}`"
-            raise refuse(f"has {len(stated)} tolerances. {example}")
+            raise refuse(f"has {len(stated)} expected spreads. {example}")
         ((dimension, tolerance),) = stated.items()
         try:
             sd = standard_deviation(tolerance, f"common error {self.name!r}")
@@ -253,18 +253,18 @@ class CommonErrorRecord:
             own = parameter.dimension
             if own is not dimension:
                 raise refuse(
-                    f"of {parameter.name} has a tolerance of {dimension.value}, but the parameter "
-                    f"has the dimension {own.value}. Use the key `{own.value}`"
+                    f"of {parameter.name} has an expected spread of {dimension.value}, but the "
+                    f"parameter has the dimension {own.value}. Use the key `{own.value}`"
                 )
             if parameter.tolerance is None:
                 raise refuse(
-                    f"of {parameter.name}: the parameter has no separate tolerance. Give it, "
+                    f"of {parameter.name}: the parameter has no separate expected spread. Give it, "
                     "because no two parts are exactly equal"
                 )
         if len(chosen) < 2:
             raise refuse(
                 f"belongs to {chosen[0].name} alone. Name two or more parameters, or give the "
-                "tolerance of that parameter"
+                "expected spread of that parameter"
             )
         return CommonError(self.name, tuple(parameter.name for parameter in chosen), sd)
 

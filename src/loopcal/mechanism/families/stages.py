@@ -265,7 +265,7 @@ class SerialJoint:
     sigma : standard deviation of the reading.
     errors : its unknowns: displacements of the placed frame, the `offset` of the joint, its `gain`.
     platform_errors : unknown displacements of the platform of this stage.
-    length, angle, ratio : tolerances of these unknowns.
+    length, angle, ratio : expected spreads of these unknowns.
     """
 
     GIVEN: ClassVar[Dimension] = Dimension.LENGTH
@@ -334,7 +334,7 @@ class Stages(RobotRecord):
     controlled : commanded coordinates of the end platform, one for each freedom that its actuators
         give it. held : actuators that inverse kinematics leaves at their present readings. stages :
         from the base on. The last one carries the end platform.
-    tolerances : of the unknowns of serial joints without tolerances.
+    tolerances : of the unknowns of serial joints without expected spreads of their own.
     """
 
     family = "stages"

@@ -320,7 +320,7 @@ def compute_pair_rank(study: Study) -> tuple[int, int]:
 class Cell:
     """t machines with errors of one size, calibrated from points with noise of one size."""
 
-    size: float  # standard deviation of the errors [tolerances]
+    size: float  # standard deviation of the errors [spreads]
     noise: float  # standard deviation of a held coordinate [mm]
     errors: Mapping[str, Mapping[str, FloatArray]]  # by BEFORE, LS, MAP and measure, (t,)
     iterations: IntArray  # (t,) of LS

@@ -68,7 +68,7 @@ MEASURES = (
     "position [mm]",
     "phi and theta [deg]",
     "direction of the normal [deg]",
-    "parameters [tolerances]",
+    "parameters [spreads]",
     "parameters farther from the truth than nominal [share]",
 )
 ERRORS = 3  # purpose of a random stream
