@@ -218,7 +218,7 @@ def save_comparison(comparison: RunComparison, path: str | Path) -> Path:
         document = build_comparison_document(comparison, f"loopcal {__version__}")
         write_text(path, render_html(document))
     elif ending == ".json":
-        write_text(path, to_json(comparison.to_dict()))
+        write_text(path, to_json({"format": 1, **comparison.to_dict()}))
     else:
         table = tabulate_comparison(comparison)
         titles = [column.title for column in table.columns]

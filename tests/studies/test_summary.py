@@ -203,7 +203,7 @@ def test_files_have_every_factor_as_a_column_and_are_read_back(result: StudyResu
         assert int(row["out of iterations"]) == cell.failed[OUTCOMES[FAILED]] > 0
     document = json.loads((result.folder / "summary.json").read_text("utf-8"))
     assert [cell["levels"] for cell in document["cells"]] == [c.levels for c in summary.cells]
-    assert document["questions"] == []
+    assert (document["format"], document["questions"]) == (1, [])
 
 
 def test_figures_show_medians_against_poses_with_their_intervals(result: StudyResult) -> None:

@@ -476,7 +476,7 @@ def write_page(reproduction: Reproduction, made_by: Mapping[str, Any]) -> str:
 
 def build_document(reproduction: Reproduction, made_by: Mapping[str, Any]) -> dict[str, Any]:
     """Return the content of result.json."""
-    return {"made_by": made_by, **serialization.json_fields(reproduction)}
+    return {"format": 1, "made_by": made_by, **serialization.json_fields(reproduction)}
 
 
 def write_folder(
@@ -494,7 +494,8 @@ def write_folder(
         stream = StringIO()
         csv.writer(stream, lineterminator="\n").writerows([table.columns, *rows])
         files[f"tables/{table.name}.csv"] = stream.getvalue().encode()
-        files[f"tables/{table.name}.json"] = to_json(serialization.json_fields(table)).encode()
+        document = {"format": 1, **serialization.json_fields(table)}
+        files[f"tables/{table.name}.json"] = to_json(document).encode()
     styles = choose_styles(content.figures)
     for figure in content.figures:
         files[f"figures/{figure.name}.png"] = render_figure(draw(figure, styles), ".png")

@@ -25,6 +25,7 @@ from loopcal.results.tables import (
     Column,
     Table,
     build_table,
+    choose_coarser,
     choose_unit,
     format_exact_beside,
     format_in,
@@ -35,7 +36,7 @@ from loopcal.results.tables import (
     make_table,
     word_column,
 )
-from loopcal.units import Dimension
+from loopcal.units import UNITS, Dimension
 
 if TYPE_CHECKING:
     from loopcal.apply.calibration_report import CalibrationReport
@@ -377,11 +378,15 @@ def _build_gum_table(budget: Mapping[str, Any], robot: Mechanism, kind: str) -> 
         stated, error = line.get("stated"), math.sqrt(line[kind] or 0.0)
         cells = [ABSENT] * 5
         if stated:
-            symbol, u = stated["unit"], stated["u"]
-            value, sensitivity = f"{stated['value']:.6g} {symbol}", format_in(unit, error / u, 3)
-            per = f"{sensitivity} {unit} per {symbol}" if error else "0"
+            of = choose_coarser(UNITS[stated["unit"]], stated["value"])
+            factor = UNITS[stated["unit"]].factor_to_si / of.factor_to_si
+            value, u = factor * stated["value"], factor * stated["u"]
+            is_ratio = of.dimension is unit.dimension
+            sensitivity = error / u / of.factor_to_si if is_ratio else error / u / unit.factor_to_si
+            per = "" if is_ratio or not error else f" {unit} per {of}"
             divisor = format_number(stated["divisor"], 3)
-            cells = [value, stated["distribution"], divisor, f"{format_number(u, 3)} {symbol}", per]
+            cells = [f"{value:.6g} {of}", stated["distribution"], divisor]
+            cells += [f"{format_number(u, 3)} {of}", f"{format_number(sensitivity, 3)}{per}"]
         shown = [*cells, format_in(unit, error, 3), _format_degrees(line["degrees"] or math.inf)]
         rows.append((_name_source(line), line["evaluation"], *shown))
     total = format_in(unit, budget[kind]["rms"] or 0.0, 3)

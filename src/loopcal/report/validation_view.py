@@ -164,6 +164,8 @@ def view_error_statistics(validation: Validation, with_before: bool = True) -> l
     numbers = map(Column, ("count", *(metric.words for metric in METRICS.values())))
     caption = f"Error statistics (rows x targets), {validation.frame}"
     table = make_table(caption, ("error", "quantity", *numbers, "unit"), rows)
+    if not rows:
+        return []
     if with_before and is_correctable:
         return [table, "The actuators can correct all of the measured error."]
     return [table]

@@ -249,6 +249,18 @@ def choose_unit(unit: Unit, values: Iterable[float | None]) -> Unit:
     return UNITS[choose_symbol(largest, unit.symbol)[0]] if largest >= ROUNDING else unit
 
 
+COARSER = {"nm": "um", "um": "mm", "urad": "mrad"}
+
+
+def choose_coarser(unit: Unit, value: float) -> Unit:
+    """Return the unit of a number that a user stated: a coarser one from 100 on."""
+    while unit.symbol in COARSER and abs(value) >= 100.0:
+        coarser = UNITS[COARSER[unit.symbol]]
+        value *= unit.factor_to_si / coarser.factor_to_si
+        unit = coarser
+    return unit
+
+
 def format_with_uncertainty(value: float, uncertainty: float, digits: int = 9) -> str:
     """Return a value to the second significant digit of its uncertainty.
 

@@ -813,7 +813,7 @@ def build_document(
     summary: StudySummary, answered: Sequence[AnsweredQuestion]
 ) -> dict[str, object]:
     """Return the content of summary.json."""
-    return {**vars(summary), "questions": list(answered)}
+    return {"format": 1, **vars(summary), "questions": list(answered)}
 
 
 def write_summary(

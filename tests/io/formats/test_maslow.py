@@ -45,7 +45,7 @@ def write_log(sigma: float) -> None:
     Path("maslow.log").write_text("\n".join(["[MSG:INFO: Measured waypoint 8]", *lines, ""]))
 
 
-def test_a_log_leads_to_the_true_frame() -> None:
+def test_a_log_leads_to_the_true_frame(capsys) -> None:
     write_log(0.5)
     words = "import maslow.yaml --format maslow --probes maslow.log -o m.yaml --data m.csv"
     assert main([*words.split(), "--sigma-line", "0.5mm"]) == 0
@@ -57,6 +57,9 @@ def test_a_log_leads_to_the_true_frame() -> None:
         belt, _, axis = name.split(".")
         assert abs(row["estimate"] - ANCHORS[belt]["xy".index(axis)]) < 1.5 * row["plus_minus"]
         assert row["plus_minus"] < 3.0
+    capsys.readouterr()
+    assert main(["budget", "run"]) == main(["report", "run", "-o", "run.html"]) == 0
+    assert "0.5 mm  normal" in capsys.readouterr().out  # not 500 um
     assert (
         main(["export", "run", "--format", "maslow", "--into", "maslow.yaml", "-o", "new.yaml"])
         == 0

@@ -239,7 +239,7 @@ def _draw_histogram(axes: Axes, whitened: FloatArray) -> None:
     reach = max(4.0, float(np.abs(whitened).max(initial=0.0)))
     bins = int(np.clip(np.sqrt(len(whitened)) * 1.5, 8, 60))
     edges, x = np.linspace(-reach, reach, bins + 1).tolist(), np.linspace(-reach, reach, 200)
-    axes.hist(whitened, edges, density=True, color=COLORS[5], ec="white")
+    axes.hist(whitened, edges, density=whitened.size > 0, color=COLORS[5], ec="white")
     axes.plot(x, np.exp(-0.5 * x**2) / np.sqrt(2.0 * np.pi), color=DARK, lw=LINE)
     label_axes(axes, SIGMAS, "density [1/sigma]", "histogram, line: given noise")
 
