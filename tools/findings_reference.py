@@ -18,6 +18,7 @@ ROOT = Path(__file__).resolve().parent.parent
 PAGE = ROOT / "docs" / "findings.md"
 WORDING = ROOT / "tests" / "findings" / "wording.txt"
 
+SENTENCE_END = re.compile(r"(?<=[.?]) (?=[A-Z`'{]|loopcal)")
 PLACEHOLDER = re.compile(r"\{(?P<name>\w+)[^{}]*\}")
 SEVERITIES = {
     Severity.INFO: "worth knowing. The result is usable as it is",
@@ -36,17 +37,19 @@ and data. The text is for people and may change. In Python, results hold `findin
 is the text, and an error has the `code` of its finding. In JSON, the keys are `code`, `severity`,
 `data` and `text`.
 
-Words in *italics* stand for data, and texts in quotation marks are examples. A text that begins
-with a small letter is a part of another message. The last column adds the condition and the next
-step that the text leaves out.
+The table has the first sentence of each message. The message itself continues with numbers, the
+reason or the next step. Words in *italics* stand for data, and sentences in quotation marks are
+examples. A sentence that begins with a small letter is a part of another message. The last column
+adds what the message leaves out: its condition, and what to do.
 """
 
 
 def describe_text(entry: Entry) -> str:
-    """Return the text of an entry for the page: placeholders in italics, or an example."""
+    """Return the first sentence of an entry: placeholders in italics, or an example."""
+    first = SENTENCE_END.split(entry.word_example(), maxsplit=1)[0]
     if depends_on_data(entry.text):
-        return f'"{entry.word_example()}"'
-    return PLACEHOLDER.sub(lambda match: f"*{match['name'].replace('_', ' ')}*", entry.text)
+        return f'"{first}"'
+    return PLACEHOLDER.sub(lambda match: f"*{match['name'].replace('_', ' ')}*", first)
 
 
 def write_page() -> str:

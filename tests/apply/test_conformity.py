@@ -255,7 +255,7 @@ def held_out():
 def test_validation_states_conformity_on_the_page_and_in_the_result(held_out) -> None:
     result = validate(*held_out, limit_position=0.2e-3)
     text = str(view_validation(result, True, False))
-    assert "Largest position error of 10, without the noise of the measurement: " in text
+    assert "Largest of 10 position errors, without the noise of the measurement: " in text
     (finding,) = [f for f in result.findings if f.code == "conformity.conforms"]
     assert " um " in str(finding)
     assert " mm" not in str(finding)

@@ -139,4 +139,4 @@ def test_seven_heights_get_one_statement_about_the_noise(printers, chi_square, c
         assert fit.chi_square == pytest.approx(chi_square, rel=1e-3)
         test = fit.residual_test.finding
         assert (test.code, test.severity) == (code, severity)
-        assert list_codes(find_outliers(fit, scaled).findings) == {"outliers.one-degree"}
+        assert list_codes(find_outliers(fit, scaled).findings) == {"outliers.not-testable"}

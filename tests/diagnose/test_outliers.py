@@ -282,15 +282,15 @@ def test_one_degree_of_freedom_names_no_outlier_and_no_conflict(wrong):
     assert len(group.poses) == 7
     assert group.times == pytest.approx(np.sqrt(fit.chi_square), rel=1e-3)  # not linear over 1 mm
     (summary,) = result.summary
-    assert summary.code == "outliers.one-degree"  # the only statement on outliers
+    assert summary.data["reason"] == "one-degree"  # the only statement on outliers
     codes = [f.code for f in examine_fit(fit, data).findings]
-    assert [code for code in codes if code.startswith("outliers.")] == ["outliers.one-degree"]
+    assert [code for code in codes if code.startswith("outliers.")] == ["outliers.not-testable"]
 
 
 @pytest.mark.parametrize(
     ("points", "off", "noise", "names", "codes"),
     [
-        (7, {3: 1e-3}, "estimated", (), ["outliers.unknown-noise"]),
+        (7, {3: 1e-3}, "estimated", (), ["outliers.not-testable"]),
         (12, {4: 1e-3}, "given", ("5",), ["outliers.some"]),
         # no single height explains both, and any two do
         (8, {0: 1e-3, 1: -1e-3}, "given", (), ["outliers.ambiguous"]),

@@ -327,12 +327,12 @@ def _use_map(posterior: Posterior | None) -> tuple[Finding, Posterior]:
         raise EstimationError(report_finding("compensation.map-needs-run"))
     own = posterior.discrepancy
     if own is None:
-        raise EstimationError(report_finding("compensation.map-no-errors"))
+        raise EstimationError(report_finding("compensation.map-not-tested", is_smooth=False))
     before, after, lowest, regions = own.test.tolist()
     values: dict[str, Any] = {"before": before, "after": after, "regions": int(regions)}
     values["lowest"] = 100.0 * lowest
     if np.isnan(lowest):
-        raise EstimationError(report_finding("compensation.map-not-tested"))
+        raise EstimationError(report_finding("compensation.map-not-tested", is_smooth=True))
     if not len(own.mean):
         raise EstimationError(report_finding("compensation.map-no-gain", **values))
     corrected = replace(posterior, discrepancy=replace(own, is_corrected=True))

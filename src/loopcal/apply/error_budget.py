@@ -43,8 +43,8 @@ from loopcal.estimate.linearization import Linearization
 from loopcal.estimate.posterior import DISCREPANCY, INFLATION, NOISE, TOLERANCES, combine_degrees
 from loopcal.estimate.problem import Problem
 from loopcal.estimate.result import Identification
-from loopcal.findings import Finding, report_finding
-from loopcal.findings.wording import round_to_digits
+from loopcal.findings import Finding, Quantity, report_finding
+from loopcal.findings.wording import choose_symbol, round_to_digits
 from loopcal.measure.array_checks import drop_repeats
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations, StatedSize, find_size
@@ -757,12 +757,18 @@ def _word(
         size = fit.robot.size if dimension is Dimension.LENGTH else 1.0
         stated[name] = None
         if sources.rms > ROUNDING * size:
-            quantities = {
-                key: fit.robot.to_quantity(rms, dimension)
+            sizes = {
+                key: rms
                 for key, value in sources._asdict().items()
                 if (rms := float(np.sqrt(value))) > NEGLIGIBLE * sources.rms
             }
-            stated[name] = (fit.robot.to_quantity(sources.rms, dimension), quantities)
+            least = fit.robot.to_quantity(min(sizes.values(), default=sources.rms), dimension)
+            symbol, factor = choose_symbol(least.value, least.unit)  # one unit for all
+            total, *parts = (
+                Quantity(factor * fit.robot.to_quantity(rms, dimension).value, symbol)
+                for rms in (sources.rms, *sizes.values())
+            )
+            stated[name] = (total, dict(zip(sizes, parts, strict=True)))
     return report_finding(
         "accuracy.budget",
         **stated,

@@ -119,18 +119,17 @@ def estimate_calibration_gain(
         stated, see `choose_error_frame`; "relative" means relative to the home pose.
     """
     free = fit.free_parameters
-    if free.assumed.any():
-        missing = int(free.assumed.sum())
-        return CalibrationGain(report_finding("model.gain-needs-tolerances", missing=missing))
-    if fit.residual_test.failed:
-        return CalibrationGain(report_finding("model.gain-needs-consistent-noise"))
+    missing, is_contradicted = int(free.assumed.sum()), fit.residual_test.failed
+    unknown = report_finding("model.gain-unknown", missing=missing, is_contradicted=is_contradicted)
+    if missing or is_contradicted:
+        return CalibrationGain(unknown)
     solution = locate_measured_poses(fit, data, MOST_POSES)
     # S with S S' the covariance of the estimate; undetermined directions keep their tolerance
     posterior = fit.posterior.without_discrepancy
     variance = np.where(np.isinf(posterior.variance), 1.0, posterior.variance)
     factor = posterior.directions * np.sqrt(variance)
     if not len(solution.q) or np.isnan(factor).any():
-        return CalibrationGain(report_finding("model.gain-without-intervals"))
+        return CalibrationGain(unknown)
     effects = linearize_tool_errors(fit.posterior, solution, frame)
     D, own = effects.by_parameters, (effects.by_frame, effects.by_discrepancy)
     expected = (D * (free.tolerance / posterior.unit)) @ free.correlation_root()

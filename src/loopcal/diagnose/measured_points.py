@@ -251,10 +251,8 @@ def _refuse_shift(table: _Points, typical: float) -> None:
     then, shift, first = best[0], -best[1], best[2]
     if then * MOVED < typical:
         numbers = {"typical": table.to_quantity(then), "before": table.to_quantity(typical)}
-        facts = {"is_late": shift > 0, **numbers}
-        if first:
-            later = report_finding("sheet.points-shifted-later", first=table.labels[first], **facts)
-            raise DataError(later)
+        begin = table.labels[first] if first else ""
+        facts = {"is_late": shift > 0, "first": begin, **numbers}
         raise DataError(report_finding("sheet.points-shifted", **facts))
 
 

@@ -538,11 +538,14 @@ class LackOfFit:
     )
 
 
+NOT_COMPARABLE = "residuals.repeats-not-comparable"
+
+
 def check_lack_of_fit(fit: Identification, data: Measurements) -> LackOfFit:
     """Test a fit against the pure error of repeated poses."""
     data = prepare_fitted_data(fit, data)
     if data.reading_sigma is not None:
-        return LackOfFit((report_finding("residuals.repeats-with-uncertain-readings"),))
+        return LackOfFit((report_finding(NOT_COMPARABLE, reason="uncertain-readings"),))
     member = data.repeats
     times = np.bincount(member)
     pure, degrees = _pure_error(fit, data, member)
@@ -553,9 +556,9 @@ def check_lack_of_fit(fit: Identification, data: Measurements) -> LackOfFit:
     scale = float(np.sqrt(pure / degrees))
     known = (int((times > 1).sum()), pure, degrees, scale)
     if fit.pose_weights.min(initial=1.0) < 1.0:
-        return LackOfFit((report_finding("residuals.repeats-with-weights"),), *known)
+        return LackOfFit((report_finding(NOT_COMPARABLE, reason="weights"),), *known)
     if lack_degrees < 1.0 or pure <= 0.0:
-        return LackOfFit((report_finding("residuals.repeats-only"),), *known)
+        return LackOfFit((report_finding(NOT_COMPARABLE, reason="few-equations"),), *known)
     ratio = max(lack, 0.0) / lack_degrees / (pure / degrees)
     p_value = float(compute_f_tail(lack_degrees, degrees, ratio))
     findings = [report_finding("residuals.explained")]

@@ -536,7 +536,7 @@ class OutlierCheck(TableResult):
         With one degree of freedom all blocks contradict each other by the same number, which the
         test of the residuals reports.
         """
-        if [finding.code for finding in self.summary] == ["outliers.one-degree"]:
+        if [finding.data.get("reason") for finding in self.summary] == ["one-degree"]:
             return self.summary
         details = [result.finding for result in (*self.outliers, *self.ambiguous)]
         return (*self.summary, *details)
@@ -636,11 +636,10 @@ def _summarize(
 ) -> tuple[Finding, ...]:
     """Return the findings on all blocks together."""
     test, blocks = fit.residual_test, shared["blocks"]
-    if blocks < 2:
-        return (report_finding("outliers.single-block" if blocks else "outliers.not-testable"),)
-    if round(test.dof) <= 1:
-        is_given = test.noise == "given"
-        return (report_finding("outliers.one-degree" if is_given else "outliers.unknown-noise"),)
+    if blocks < 2 or round(test.dof) <= 1:
+        few = "one-degree" if test.noise == "given" else "unknown-noise"
+        reason = few if blocks > 1 else ("no-block", "single-block")[blocks]
+        return (report_finding("outliers.not-testable", reason=reason),)
     findings = []
     if outliers:
         findings.append(report_finding("outliers.some", count=outliers, level=level, **shared))

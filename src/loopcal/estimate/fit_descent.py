@@ -354,14 +354,15 @@ def report_closure_start(problem: Problem, options: FitOptions, fit: Descent) ->
     the steps of this start ran out.
     """
     if fit.is_start_exhausted:
-        return [report_finding("poses.closure-start-exhausted", steps=options.control.iterations)]
-    if options.begin != "closure":
+        reason = "exhausted"
+    elif options.begin == "closure" and problem.is_uncertain:
+        reason = "uncertain-readings"
+    elif options.begin == "closure" and locate_measured_poses(problem) is None:
+        reason = "incomplete-poses"
+    else:
         return []
-    if problem.is_uncertain:
-        return [report_finding("poses.closure-start-uncertain-readings")]
-    if locate_measured_poses(problem) is None:
-        return [report_finding("poses.closure-start-incomplete-poses")]
-    return []
+    steps = options.control.iterations
+    return [report_finding("poses.closure-start-unused", reason=reason, steps=steps)]
 
 
 def locate_measured_poses(problem: Problem) -> FloatArray | None:

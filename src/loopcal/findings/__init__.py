@@ -117,7 +117,7 @@ residuals.heavy-tailed
 noise.doubtful noise.no-degrees-of-freedom
 workflow.height-shift workflow.undetermined-scale
 setup.two-solutions setup.fixed identifiability.board-scale
-noise.consistent noise.estimated outliers.none outliers.one-degree workflow.height-tilt
+noise.consistent noise.estimated outliers.none outliers.not-testable workflow.height-tilt
 workflow.frame-freedoms
 prior.machine-unchanged model.simpler-suffices model.all-needed model.expected-gain
 residuals.start-not-calibrated residuals.start-within-noise residuals.start-is-best

@@ -140,11 +140,16 @@ def _build_home_checker(robot: Mechanism, constraints: Constraints | None) -> Co
     checker = build_checker(robot, constraints)
     check = checker.check_poses(inverse(robot, locate_home(robot)[None]), at_pose=False)
     if not check.allowed[0]:
-        reasons = list_reasons(check.count_violations())
-        raise MechanismError(
-            report_finding("plan.home-excluded", robot=robot.name, reasons=reasons)
-        )
+        raise _refuse_home(robot, check.count_violations(), is_isolated=False)
     return checker
+
+
+def _refuse_home(
+    robot: Mechanism, counts: Counter[Violation], *, is_isolated: bool
+) -> MechanismError:
+    """Return the error of a home that no path of a plan can leave."""
+    facts = {"robot": robot.name, "reasons": list_reasons(counts), "is_isolated": is_isolated}
+    return MechanismError(report_finding("plan.home-excluded", **facts))
 
 
 def _draw_boundary(
@@ -198,8 +203,6 @@ def _keep_reachable(
     counts = path.count_violations()
     excluded.update({replace(why, on_path=True): count for why, count in counts.items()})
     if not path.allowed.any():
-        raise MechanismError(
-            report_finding("plan.home-isolated", robot=robot.name, reasons=list_reasons(counts))
-        )
+        raise _refuse_home(robot, counts, is_isolated=True)
     kept = poses[path.allowed]
     return Candidates(kept, inverse(robot, kept), uniform[path.allowed], excluded, n_drawn, checker)

@@ -309,8 +309,8 @@ def largest_error(data: Data) -> str:
         places = max(0, 1 - math.floor(math.log10(expanded)))
         value, uncertainty = (f"{x:.{places}f}" for x in (estimate, expanded))
     template = (
-        "Largest {quantity} error {is_volume:if|in the volume|of {count}, without the noise of the "
-        "measurement}: "
+        "Largest {is_volume:if|{quantity} error in the volume|of {count} {quantity} errors, "
+        "without the noise of the measurement}: "
     )
     subject = f"{fill_template(template, **data)}{value} {unit}"
     if abs(high + low - 2.0 * estimate) <= LARGEST_SKEW * (high - low):

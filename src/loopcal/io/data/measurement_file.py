@@ -679,12 +679,9 @@ def load_instrument_to_plan(path: str | Path, robot: Mechanism) -> Instrument:
             if parameter.scope == "group"
         ]
         if parameters and (apart or len({groups[row] for row in entry.rows}) > 1):
-            is_surface = entry.kind.name in {"plane", "line"}
-            code = "files.surfaces-in-plan" if is_surface else "files.groups-in-plan"
-            raise table.settings.error(
-                report_finding(code, kind=entry.kind.name, parameters=tuple(parameters)),
-                entry.location,
-            )
+            facts = {"kind": entry.kind.name, "parameters": tuple(parameters)}
+            problem = report_finding("files.groups-in-plan", **facts)
+            raise table.settings.error(problem, entry.location)
     return _build_instrument(table, kinds)
 
 
