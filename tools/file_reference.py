@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, get_args
 
-from loopcal.io.core.limits import COUNT_LIMITS, LIMITS
+from loopcal.io.core.limits import LIMITS
 from loopcal.io.core.records import get_field_types
 from loopcal.io.data.columns import RULES
 from loopcal.io.data.kind_settings import SETTINGS, list_kind_settings
@@ -35,6 +35,7 @@ DOCS = Path(__file__).resolve().parent.parent / "docs"
 EXAMPLES = DOCS.parent / "examples" / "exports"
 PAGE, EXPORTS = DOCS / "files.md", DOCS / "exports.md"
 AXIS = file_reference.describe_type(Axis)
+Keys = list[file_reference.Key]
 BLOCK = r"made by tools.file_reference: (?P<name>[\w-]+)"
 
 
@@ -63,10 +64,38 @@ def list_nested_records(record: type) -> tuple[type, ...]:
     return tuple(nested)
 
 
-def format_record(record: type, without: Iterable[str] = ()) -> str:
-    """Return the keys of a record but those that `without` names."""
+def format_record(
+    record: type, without: Iterable[str] = (), shown: dict[str, Keys] | None = None
+) -> str:
+    """Return the keys of a record but those that `without` names.
+
+    shown : the keys of the records above, to which this one is added. A record refers to another
+    one with which it shares most keys.
+    """
     excluded = set(without)
     keys = [key for key in file_reference.list_keys(record) if key.name not in excluded]
+    sentence, own = refer_to_others(keys, shown or {})
+    if shown is not None:
+        shown[file_reference.name_record(record)] = keys
+    return sentence + format_keys(own)
+
+
+def refer_to_others(keys: Keys, shown: dict[str, Keys]) -> tuple[str, Keys]:
+    """Return a sentence that refers to a record with most of these keys, and the other keys."""
+    for name in sorted(shown, key=lambda name: len(set(keys) & set(shown[name])), reverse=True):
+        common = set(keys) & set(shown[name])
+        names = {key.name for key in keys}
+        left_out = [f"`{key.name}`" for key in shown[name] if key.name not in names]
+        if len(common) >= 5 and len(left_out) <= 5:
+            without = f" without {', '.join(left_out)}" if left_out else ""
+            own = [key for key in keys if key not in common]
+            return f"Keys as of **{name}**{without}{', and' if own else '.'}\n\n", own
+        break
+    return "", keys
+
+
+def format_keys(keys: Keys) -> str:
+    """Return a table of keys, or a list if none has a meaning."""
     rows = merge_rows((f"`{k.name}`", _hold(k), k.default, k.meaning) for k in keys)
     if any(key.meaning for key in keys):
         return format_table(("key", "holds", "default", "meaning"), rows)
@@ -90,8 +119,9 @@ def _hold(key: file_reference.Key) -> str:
 
 def format_common() -> str:
     """Return what every robot file may say."""
+    shown: dict[str, Keys] = {}
     sections = [format_record(RobotRecord)]
-    sections += [_format_nested(record) for record in list_common_records()]
+    sections += [_format_nested(record, shown) for record in list_common_records()]
     return "\n".join(sections)
 
 
@@ -106,18 +136,22 @@ def format_families() -> str:
     """Return the keys of every family, beside the common ones."""
     shared = [key.name for key in file_reference.list_keys(RobotRecord)]
     common, sections = list_common_records(), []
+    shown: dict[str, Keys] = {}
+    for record in common:
+        format_record(record, shown=shown)
     for name, family in FAMILIES.items():
         records = list_nested_records(family)
         sections.append(
-            f"### `family: {name}`\n\n{summarize(family)}\n\n{format_record(family, shared)}"
+            f"### `family: {name}`\n\n{summarize(family)}\n\n{format_record(family, shared, shown)}"
         )
-        sections += [_format_nested(record) for record in records if record not in common]
+        shown[f"family: {name}"] = shown.pop(file_reference.name_record(family))
+        sections += [_format_nested(record, shown) for record in records if record not in common]
     return "\n".join(sections)
 
 
-def _format_nested(record: type) -> str:
+def _format_nested(record: type, shown: dict[str, Keys] | None = None) -> str:
     name, summary = file_reference.name_record(record), summarize(record)
-    return f"**{name}**: {summary}\n\n{format_record(record)}"
+    return f"**{name}**: {summary}\n\n{format_record(record, shown=shown)}"
 
 
 def format_kinds() -> str:
@@ -223,12 +257,6 @@ def format_limits() -> str:
     return format_table(("limit", "at most", "applies to"), rows)
 
 
-def format_counts() -> str:
-    """Return the largest numbers that options take."""
-    rows = [(str(limit), limit.meaning) for limit in COUNT_LIMITS]
-    return format_table(("at most", "option"), rows)
-
-
 def format_profile() -> str:
     """Return the keys of a profile of exports."""
     return format_record(ProfileRecord)
@@ -273,7 +301,6 @@ BLOCKS = {
     "limits": format_limits,
     "study": format_study,
     "scores": format_scores,
-    "counts": format_counts,
 }
 EXPORT_BLOCKS = {
     "profile": format_profile,

@@ -242,37 +242,28 @@ LIMITS = tuple(value for value in vars().values() if isinstance(value, FileLimit
 
 
 class CountLimit(NamedTuple):
-    """The largest number that an option takes; `meaning` names commands and options."""
+    """The largest number that an option takes."""
 
     most: int
     unit: str
-    meaning: str
 
     def __str__(self) -> str:
         return f"{self.most:,} {self.unit}"
 
 
-DRAWN_POSES = CountLimit(
-    1_000_000, "poses to draw", "`draw` of `loopcal simulate` and `loopcal identifiability`"
-)
-PLANNED_POSES = CountLimit(
-    2_000, "poses of a plan", "`poses` and `hold-out` of `loopcal plan`, each"
-)
-CANDIDATES = CountLimit(100_000, "candidate poses", "`candidates` of `loopcal plan`")
-GROUPS = CountLimit(1_000, "groups of points", "`groups` of `loopcal plan`")
-POINTS = CountLimit(1_000, "points of a group", "`points` of `loopcal plan`")
-RESAMPLES = CountLimit(100_000, "resamples", "`count` of `loopcal bootstrap`")
-DRAWS = CountLimit(1_000_000, "draws", "`count` of `loopcal sample`")
-TRIALS = CountLimit(10_000, "trials", "`trials` of `loopcal reproduce`")
-STEPS = CountLimit(1_000, "steps", "`steps` of `loopcal compensate` and `loopcal per-leg`")
-FOLDS = CountLimit(1_000, "folds", "`folds` of `loopcal regularize`")
-REPLICATES = CountLimit(
-    10**9, "trials of a cell", "`replicates` of study files and of `loopcal study extend`"
-)
-WORKERS = CountLimit(4_096, "workers", "`workers` of `loopcal study run` and `extend`")
-SQUARES = CountLimit(100, "squares", "`columns` and `rows` of `loopcal board`, each")
-# The limits of counts, in the order of docs/files.md.
-COUNT_LIMITS = tuple(value for value in vars().values() if isinstance(value, CountLimit))
+DRAWN_POSES = CountLimit(1_000_000, "poses to draw")
+PLANNED_POSES = CountLimit(2_000, "poses of a plan")
+CANDIDATES = CountLimit(100_000, "candidate poses")
+GROUPS = CountLimit(1_000, "groups of points")
+POINTS = CountLimit(1_000, "points of a group")
+RESAMPLES = CountLimit(100_000, "resamples")
+DRAWS = CountLimit(1_000_000, "draws")
+TRIALS = CountLimit(10_000, "trials")
+STEPS = CountLimit(1_000, "steps")
+FOLDS = CountLimit(1_000, "folds")
+REPLICATES = CountLimit(10**9, "trials of a cell")
+WORKERS = CountLimit(4_096, "workers")
+SQUARES = CountLimit(100, "squares")
 
 # The rule for names in files: of robots, limbs, actuators, poses, sessions, targets, columns.
 
