@@ -88,7 +88,10 @@ MISTAKES = {
         ("session,N1.x", "use,session,N1.x", "am,300.01", "held-out,am,300.01"),
         "base.csv:8: this row measures the base and belongs to no pose, but column 'use'",
     ),
-    "a misspelled body": (("of: base", "of: bse"), "base.csv:2: 'linear-delta' has no stage 'bse'"),
+    "a misspelled body": (
+        ("of: base", "of: bse"),
+        "base.csv:2: 'linear-delta' has no stage or body 'bse'",
+    ),
     "no places": (
         (
             ", [200 mm, 350 mm, 50 mm], [-350 mm, 50 mm, 20 mm]]\n",

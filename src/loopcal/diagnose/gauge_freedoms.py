@@ -28,10 +28,10 @@ from loopcal.estimate.linearization import spread_states
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
 from loopcal.mechanism.actuation import solve_at_pose
-from loopcal.mechanism.chains import get_platforms
+from loopcal.mechanism.chains import locate_bodies
 from loopcal.mechanism.kinematics import compute_readings, find_directly_reachable, forward_trials
 from loopcal.mechanism.model import Mechanism
-from loopcal.mechanism.sensitivity import differentiate_platform, differentiate_pose
+from loopcal.mechanism.sensitivity import differentiate_bodies, differentiate_pose
 from loopcal.mechanism.solutions import inverse
 from loopcal.mechanism.states import Status
 from loopcal.mechanism.workspace import check_limits, draw_coordinates, workspace_ranges
@@ -288,22 +288,13 @@ def observe_bodies(
     """Return the same of bodies beside the platform (`bodies:`, platforms of stages), by name."""
     values, q = robot.values[None], readings[None]
     state = forward_trials(robot, values, q)
-    if robot.stages:
-        names = [stage.name for stage in robot.stages[:-1]]
-        poses = get_platforms(robot, state)
-        each = [
-            differentiate_platform(robot, values, q, state, end=end).parameters[0]
-            for end in range(len(names))
-        ]
-    elif robot.has_open_sums or not state.others:
-        return {}
-    else:
-        names, poses = list(robot.assembly.bodies), list(state.others)
-        twists = differentiate_pose(robot, values, q, state, nodes=1 + len(names)).parameters[0]
-        each = np.split(twists[:, 6:], len(names), axis=1)
+    poses = locate_bodies(robot, state)
+    names = list(poses)[: len(robot.stages) - 1 if robot.stages else None]
+    twists = differentiate_bodies(robot, values, q, state, names)
+    each = {name: moved.parameters[0] for name, moved in twists.items()}
     usable = state.status[0] == Status.CONVERGED
-    kept = [usable & np.isfinite(D).all(axis=(1, 2)) for D in each]
-    return {n: (T[0, k], D[k]) for n, T, D, k in zip(names, poses, each, kept, strict=False)}
+    kept = {name: usable & np.isfinite(D).all(axis=(1, 2)) for name, D in each.items()}
+    return {name: (poses[name][0, kept[name]], D[kept[name]]) for name, D in each.items()}
 
 
 def interpret_combinations(

@@ -249,18 +249,16 @@ def fit_poses(
 MOST = 0.5
 """Share of open poses above which a geometry is not one to begin with."""
 
-MM = 1e3
-
 
 class UnclosedPoses(NamedTuple):
     """Poses at which the loops do not close with their readings.
 
-    poses : their labels, the widest open first. gaps : (k,) [m] what is left open in the loops.
+    poses : their labels, the widest open first. gaps : what is left open in the loops.
     total : number of poses with all readings.
     """
 
     poses: tuple[str, ...]
-    gaps: FloatArray
+    gaps: tuple[Quantity, ...]
     total: int
 
     @property
@@ -271,11 +269,7 @@ class UnclosedPoses(NamedTuple):
     def report(self, code: str) -> Finding:
         """Return the finding or error of this code, with poses and gaps."""
         return report_finding(
-            code,
-            count=len(self.poses),
-            total=self.total,
-            poses=self.poses,
-            gaps=tuple(Quantity(float(gap) * MM, "mm") for gap in self.gaps),
+            code, count=len(self.poses), total=self.total, poses=self.poses, gaps=self.gaps
         )
 
 
@@ -286,13 +280,13 @@ def find_unclosed_poses(robot: Mechanism, data: Measurements) -> UnclosedPoses:
     none: a pose that they do not reach is refused by `check_start`.
     """
     if robot.redundancy is None:
-        return UnclosedPoses((), np.zeros(0), data.n_poses)
+        return UnclosedPoses((), (), data.n_poses)
     used = np.flatnonzero(np.isfinite(data.readings).all(axis=1))
     if not len(used):
-        return UnclosedPoses((), np.zeros(0), 0)
+        return UnclosedPoses((), (), 0)
     solution = forward(robot, data.readings[used])
     is_open = np.flatnonzero(~solution.converged)
     gaps = solution.residual[is_open]
     order = np.argsort(-np.where(np.isfinite(gaps), gaps, np.inf), kind="stable")
     labels = tuple(data.labels[i] for i in used[is_open[order]])
-    return UnclosedPoses(labels, gaps[order], len(used))
+    return UnclosedPoses(labels, tuple(map(robot.describe_gap, gaps[order].tolist())), len(used))

@@ -17,7 +17,7 @@ from loopcal.errors import DataError, suggest_names
 from loopcal.measure.array_checks import broadcast_array, refuse_first
 from loopcal.measure.kinds.kind import Kind
 from loopcal.measure.observations import Observations
-from loopcal.mechanism.chains import select_platform_entries
+from loopcal.mechanism.chains import locate_bodies, select_entries
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.solutions import Solution, inverse
 from loopcal.numerics.statistics import binomial_tail, compute_median
@@ -87,7 +87,7 @@ def select_joint_values(
     """
     actuators = [actuator.name for actuator in robot.actuators]
     passive = {f"{limb.name}.{joint.name}" for limb, joint in robot.assembly.passive_joints}
-    entries = select_platform_entries(robot, state) if robot.stages else {}
+    entries = select_entries(robot, state)
     values = {}
     for name in names:
         if name in actuators:
@@ -97,10 +97,10 @@ def select_joint_values(
         elif name in entries:
             values[name] = entries[name]
         elif ":" in name:
-            stage, stages = name.partition(":")[0], [stage.name for stage in robot.stages]
+            body, bodies = name.partition(":")[0], list(locate_bodies(robot, state))
             raise DataError(
-                f"{robot.name!r} has no stage {stage!r}{suggest_names(stage, stages)}; "
-                f"{'its stages are ' + ', '.join(stages) if stages else 'it is not a chain'}"
+                f"{robot.name!r} has no stage or body {body!r}{suggest_names(body, bodies)}; "
+                f"it has {', '.join(bodies) or 'none beside the platform'}"
             )
         else:
             known = [*actuators, *passive]

@@ -4,11 +4,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
-from loopcal import engine
+from loopcal import engine, geometry
 from loopcal.engine import Program, State
 from loopcal.mechanism.limb_rows import (
     differentiate_displacements,
@@ -16,6 +16,7 @@ from loopcal.mechanism.limb_rows import (
     join_columns,
     linearize_limbs,
     move_passive_joints,
+    name_entries,
     name_passive_joints,
     select_block,
     stack_closure_rows,
@@ -36,7 +37,7 @@ from loopcal.mechanism.transmission import (
     select_weights,
 )
 from loopcal.numerics.trial_batch import map_arrays
-from loopcal.typing import FloatArray
+from loopcal.typing import FloatArray, IntArray
 
 
 class Derivatives(NamedTuple):
@@ -66,30 +67,44 @@ def drive_joints(robot: Mechanism, values: FloatArray, q: FloatArray) -> DrivenJ
 
 @dataclass(frozen=True, eq=False)
 class OpenSums:
-    """Sums of driven joints: how many of them, the first ones, commanded readings choose, and the
-    values (t | 1, 1, r) [m, rad] of the others; weights : (t | 1, r, J).
+    """Sums of driven joints: those of commanded readings, at `places` among all readings, and
+    behind them others with the values `fixed` (t | 1, 1, ..) [m, rad]. weights : (t | 1, r, J).
     """
 
-    chosen: int
+    shared: ClassVar[tuple[str, ...]] = ("places",)
+
+    places: IntArray
     fixed: FloatArray
     weights: FloatArray
 
+    @property
+    def chosen(self) -> int:
+        """How many of the sums commanded readings choose."""
+        return len(self.places)
+
     def complete(self, u: FloatArray) -> FloatArray:
-        """Return all sums (t, n, r) of readings' own ones (t, n, u), fixed ones behind them."""
+        """Return all sums (t, n, r) of values of all readings (t, n, a)."""
         fixed = np.broadcast_to(self.fixed, (*u.shape[:2], self.fixed.shape[2]))
-        return np.concatenate([u[..., : self.chosen], fixed], axis=2)
+        return np.concatenate([u[..., self.places], fixed], axis=2)
 
     def read(self, joints: FloatArray) -> FloatArray:
         """Return the sums (t, n, chosen) of joint values (t, n, J)."""
         return apply_weights(self.weights[:, : self.chosen], joints)
 
 
-def list_open_sums(robot: Mechanism, values: FloatArray) -> OpenSums:
-    """Return the sums for values (t | 1, p), conditions at their references."""
+def list_open_sums(
+    robot: Mechanism, values: FloatArray, places: IntArray | None = None
+) -> OpenSums:
+    """Return the sums for values (t | 1, p), conditions at their references; places : of the
+    readings that choose sums, default all.
+    """
     (_, tau), constants = robot.slots(values), robot.slots.constants
-    weights, chosen = select_weights(tau, constants), int((~find_fixed_rows(constants)).sum())
-    assert weights is not None
-    return OpenSums(chosen, evaluate_references(tau, constants)[..., chosen:], weights)
+    count, weights = int((~find_fixed_rows(constants)).sum()), select_weights(tau, constants)
+    if weights is None:
+        weights = np.eye(robot.program.n_joints)[None]
+    chosen = np.arange(count) if places is None else places
+    own = weights[:, [*chosen, *range(count, weights.shape[1])]]
+    return OpenSums(chosen, evaluate_references(tau, constants)[..., count:], own)
 
 
 # Redundant actuation with a prescribed pose: all other joints follow.
@@ -98,7 +113,7 @@ def list_open_sums(robot: Mechanism, values: FloatArray) -> OpenSums:
 class PoseDrivenSensitivity(NamedTuple):
     """Derivatives by parameters (.., p) at constant pose, and by the platform's freedoms (.., m).
 
-    names : of the j passive joints.
+    names : of the j passive joints, and of the numbers of bodies.
     readings : (t, n, a, p) and (t, n, a, m). passive : (t, n, j, p) and (t, n, j, m).
     """
 
@@ -157,10 +172,16 @@ def differentiate_at_pose(
     readings[..., :p] -= moved.parameters[:, :, :a]
     with np.errstate(all="ignore"):
         readings /= np.einsum("...jj->...j", moved.readings[:, :, :a])[..., None]
+    names, nodes = [*name_passive_joints(robot)], np.zeros((*twists.shape[:2], 6, p + m))
+    for node, (body, T) in enumerate(zip(robot.assembly.bodies, state.others, strict=True), 1):
+        columns = [(i, f) for i, (own, f) in enumerate(program.unknown_twists) if own == node]
+        nodes[:] = 0.0
+        for i, f in columns:
+            nodes[:, :, f] = twists[:, :, i]
+        names += name_entries(body)
+        passive = np.concatenate([passive, geometry.differentiate_entries(T) @ nodes], axis=2)
     return PoseDrivenSensitivity(
-        name_passive_joints(robot),
-        (readings[..., :p], readings[..., p:]),
-        (passive[..., :p], passive[..., p:]),
+        tuple(names), (readings[..., :p], readings[..., p:]), (passive[..., :p], passive[..., p:])
     )
 
 

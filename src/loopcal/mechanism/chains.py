@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from loopcal import geometry
 from loopcal.engine import CONVERGED, EXHAUSTED, NOT_FINITE, STALLED, State
+from loopcal.mechanism.limb_rows import name_entries
 from loopcal.mechanism.model import Mechanism, Stage
 from loopcal.typing import FloatArray, IntArray
 
@@ -108,10 +109,15 @@ def locate_stage_bases(
     return bases, platforms
 
 
-def get_platforms(robot: Mechanism, state: State) -> list[FloatArray]:
-    """Return the platforms of all stages in the base at a state (t, n), each (t, n, 4, 4)."""
+def locate_bodies(robot: Mechanism, state: State) -> dict[str, FloatArray]:
+    """Return the platforms of stages, or the bodies beside the platform, in the base at a state (t,
+    n), each (t, n, 4, 4), by name.
+    """
+    if not robot.stages:
+        return dict(zip(robot.assembly.bodies, state.others, strict=True))
     assert isinstance(state, ChainState)
-    return locate_stage_bases(robot.stages, state.poses)[1]
+    platforms = locate_stage_bases(robot.stages, state.poses)[1]
+    return dict(zip((stage.name for stage in robot.stages), platforms, strict=True))
 
 
 class StagePart(NamedTuple):
@@ -151,20 +157,22 @@ def list_carrying_stages(robot: Mechanism, end: int = -1) -> list[int]:
 
 
 def find_carrying_actuators(robot: Mechanism) -> IntArray:
-    """Return the places of the actuators that move the end platform and are not held."""
+    """Return the places of the independent actuators that move the end platform, unless held."""
     places = np.flatnonzero([a.reference is None for a in robot.actuators])
-    stages = [robot.blocks[i] for i in list_carrying_stages(robot)]
-    names, own = [actuator.name for actuator in robot.actuators], np.arange(len(robot.actuators))
-    carrying = np.concatenate([own[stage.actuators] for stage in stages])
+    names, carrying = [actuator.name for actuator in robot.actuators], list[int]()
+    for stage in (robot.blocks[i] for i in list_carrying_stages(robot)):
+        own, chosen = np.arange(len(names))[stage.actuators], stage.robot.independent
+        carrying += (own if chosen is None else own[chosen]).tolist()
     held = robot.assembly.held
     return np.array([i for i in carrying if i in places and names[i] not in held], int)
 
 
 def has_spare_drives(robot: Mechanism) -> bool:
-    """Return whether a pose has infinitely many readings, because a chain has more drives than
-    coordinates.
+    """Return whether a pose has infinitely many readings, because independent drives are more than
+    the coordinates.
     """
-    return bool(robot.stages) and len(find_carrying_actuators(robot)) > len(robot.controlled)
+    is_known = bool(robot.stages) or robot.independent is not None
+    return is_known and len(find_carrying_actuators(robot)) > len(robot.controlled)
 
 
 def transport_to_end(robot: Mechanism, state: State, end: int) -> list[tuple[int, FloatArray]]:
@@ -184,15 +192,10 @@ def transport_to_end(robot: Mechanism, state: State, end: int) -> list[tuple[int
     return transports
 
 
-def name_platform_entries(stage: str) -> tuple[str, ...]:
-    """Return the names of the twelve numbers of the platform of a stage, [R t] row by row."""
-    return tuple(f"{stage}:T{row}{column}" for row in (1, 2, 3) for column in (1, 2, 3, 4))
-
-
-def select_platform_entries(robot: Mechanism, state: State) -> dict[str, FloatArray]:
-    """Return the numbers of the platforms of all stages in the base by name, each (t, n)."""
+def select_entries(robot: Mechanism, state: State) -> dict[str, FloatArray]:
+    """Return the numbers of the poses of `locate_bodies` by name, each (t, n)."""
     entries: dict[str, FloatArray] = {}
-    for stage, T in zip(robot.stages, get_platforms(robot, state), strict=True):
+    for body, T in locate_bodies(robot, state).items():
         numbers = np.moveaxis(T[..., :3, :].reshape(*T.shape[:-2], 12), -1, 0)
-        entries |= dict(zip(name_platform_entries(stage.name), numbers, strict=True))
+        entries |= dict(zip(name_entries(body), numbers, strict=True))
     return entries

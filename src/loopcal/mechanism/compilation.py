@@ -14,10 +14,19 @@ from loopcal.engine import Group, Program, Slot, State
 from loopcal.errors import MechanismError, suggest_names
 from loopcal.findings import Finding, Quantity, report_finding
 from loopcal.findings.wording import name_count
+from loopcal.mechanism.actuation import list_open_sums, stack_sum_rows
 from loopcal.mechanism.assembly import AXES, BASE, PLATFORM, Address, Assembly, AttachedStage, Limb
 from loopcal.mechanism.chains import find_carrying_actuators, join_stage_states, locate_stage_bases
 from loopcal.mechanism.inverse import inverse_trials
-from loopcal.mechanism.kinematics import compute_closure_sign, forward_trials, solve_serial
+from loopcal.mechanism.kinematics import (
+    Loops,
+    compute_closure_sign,
+    compute_limb_frames,
+    compute_readings,
+    forward_trials,
+    solve_serial,
+)
+from loopcal.mechanism.limb_rows import linearize_state
 from loopcal.mechanism.mobility import (
     STRETCHED,
     check_assembly,
@@ -42,7 +51,7 @@ from loopcal.mechanism.transmission import (
     readings_from_joints,
 )
 from loopcal.parameters import ParameterTable
-from loopcal.typing import FloatArray
+from loopcal.typing import FloatArray, IntArray
 from loopcal.units import DISPLAY_UNITS, LARGEST, SI_SYMBOLS, Dimension
 
 
@@ -74,7 +83,7 @@ def find_impossible_values(
     gap = float(state.residual[0, 0])
     finding = report_finding(
         "mechanism.values-open-loops",
-        gap=Quantity(gap * 1e3, "mm") if np.isfinite(gap) else None,
+        gap=robot.describe_gap(gap) if np.isfinite(gap) else None,
         name=table.names[largest],
         value=value,
         nominal=nominal,
@@ -181,7 +190,17 @@ def _close_at_home(
         joints = driven_values(robot.program, robot.home_state)
         return replace(robot, home_state=solve_serial(robot, e, joints))
     robot = replace(robot, home_state=_find_home(robot))
-    return check_mobility(robot)
+    count = _count_freedoms(robot)
+    if has_spare := _has_spare_drives(assembly, count):
+        refuse_free_bodies(robot, robot.home_state)
+        is_redundant = count < len(assembly.rows) - len(assembly.couplings)
+        robot = replace(robot, program=replace(robot.program, may_stay_open=is_redundant))
+    else:
+        robot = check_mobility(robot)
+    robot = replace(robot, independent=_find_independent_readings(robot))
+    if has_spare:
+        _check_drives_of_pose(robot)
+    return robot
 
 
 def compute_characteristic_length(assembly: Assembly) -> float:
@@ -397,11 +416,29 @@ def _make_first_guess(assembly: Assembly, groups: tuple[Group, ...]) -> State:
     return make_start(home, tuple(np.array([[rows]]) for rows in joints), tuple(others))
 
 
+def _count_freedoms(robot: Mechanism) -> int:
+    """Return how many freedoms the machine has with every drive free, of its unknowns less its
+    equations.
+    """
+    program, couplings = robot.program, len(robot.assembly.couplings)
+    equations = program.count_equations(free=True) + program.shared_drive_count
+    return len(program.unknown_twists) - equations - couplings
+
+
+def _has_spare_drives(assembly: Assembly, freedoms: int) -> bool:
+    """Return whether drives set more freedoms, of so many of a machine with bodies, than it names
+    controlled coordinates.
+    """
+    drives = len(assembly.rows) - len(assembly.couplings)
+    return bool(assembly.bodies) and len(assembly.controlled) < freedoms <= drives
+
+
 def _find_home(robot: Mechanism) -> State:
     """Return the closed state at the controlled coordinates of the home pose."""
-    program, values = robot.program, robot.values[None]
-    shared = program.shared_drive_count + len(robot.assembly.couplings)
-    movable = len(program.unknown_twists) - program.count_equations(free=True) - shared
+    values, movable = robot.values[None], _count_freedoms(robot)
+    shared = robot.program.shared_drive_count + len(robot.assembly.couplings)
+    if _has_spare_drives(robot.assembly, movable):
+        return _close_at_start(robot)
     if len(robot.controlled) < movable:
         raise MechanismError(
             f"{robot.name} moves in {movable} freedoms or more, but names only "
@@ -423,14 +460,39 @@ def _find_home(robot: Mechanism) -> State:
         if not shared:
             refuse_uncontrolled(robot, robot.home_state)
         refuse_singular_home(robot, state)
-        raise MechanismError(
-            f"the loops of {robot.name} do not close at its home pose: "
-            f"{state.residual[0, 0] * 1e3:.3g} mm stay open. Check the joint centers, the lengths "
-            "and `home:`"
-        )
+        raise MechanismError(_word_open_home(robot, state))
     if shared:
         return replace(state, closure_sign=compute_closure_sign(robot, values, state))
     return state
+
+
+def _close_at_start(robot: Mechanism) -> State:
+    """Return the closed state at the `start` of driven joints, those of rods at the guess of home,
+    of a machine with more drives than controlled coordinates.
+    """
+    guess, values = robot.home_state, robot.values[None]
+    frames, joints = compute_limb_frames(robot, values, guess), [*map(np.array, guess.joints)]
+    for group, own in zip(robot.program.groups, joints, strict=True):
+        if group.ending == "distance":
+            ends = np.array([frames[limb][0, 0, -2:, :3, 3] for limb in group.limbs])
+            own[..., -1] = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) - group.length
+    loops, start = Loops.place(robot, values), replace(guess, joints=tuple(joints))
+    own = loops.read(start)
+    if robot.assembly.couplings:
+        own = list_open_sums(robot, values).complete(own)
+    state = loops.solve(own, start)
+    if state.status[0, 0] != engine.CONVERGED:
+        raise MechanismError(_word_open_home(robot, state))
+    return state
+
+
+def _word_open_home(robot: Mechanism, state: State) -> str:
+    """Return the sentence for loops that do not close at home."""
+    gap = robot.describe_gap(float(state.residual[0, 0]))
+    return (
+        f"the loops of {robot.name} do not close at its home pose: {gap} stay open. Check the "
+        "joint centers, the lengths and `home:`"
+    )
 
 
 def _refuse_singular_start(robot: Mechanism, target: FloatArray) -> None:
@@ -484,7 +546,7 @@ def _build_chain(assembly: Assembly, units: Mapping[Dimension, str], record: Any
     )
     home = join_stage_states(robot, [stage.robot.home_state for stage in stages])
     robot = replace(robot, home_state=home, assembly=replace(assembly, home=np.array(home.T[0, 0])))
-    _check_chain(robot, home)
+    _check_drives_of_pose(robot)
     return robot
 
 
@@ -498,12 +560,6 @@ def _build_stages(attached: Sequence[AttachedStage]) -> tuple[Stage, ...]:
             robot = build(stage.assembly, is_stage=True)
         except MechanismError as error:
             raise MechanismError(f"stage {stage.name!r}: {error}") from None
-        if robot.program.sigma is not None or robot.has_redundant_sums:
-            raise MechanismError(
-                f"stage {stage.name!r} has {len(robot.actuators)} actuators for "
-                f"{len(robot.freedoms)} freedoms; a stage of a chain must have one actuator for "
-                "each coordinate that it sets"
-            )
         counts = len(robot.parameters), len(robot.actuators), len(robot.program.groups)
         stages.append(
             Stage(
@@ -517,6 +573,25 @@ def _build_stages(attached: Sequence[AttachedStage]) -> tuple[Stage, ...]:
         places[stage.name] = len(stages) - 1
         p, a, g = (i + n for i, n in zip((p, a, g), counts, strict=True))
     return tuple(stages)
+
+
+def _find_independent_readings(robot: Mechanism) -> IntArray:
+    """Return the places (k,) of readings that determine all redundant ones at home, of other robots
+    all places.
+    """
+    if robot.program.sigma is None and not robot.has_redundant_sums:
+        return np.arange(len(robot.actuators))
+    from scipy.linalg import qr
+
+    program, sums = robot.program, list_open_sums(robot, robot.values[None])
+    blocks, count = linearize_state(robot, robot.home_state), sums.chosen
+    rows = stack_sum_rows(program, blocks, sums.weights[:, count:])[0, 0]
+    lengths = [robot.twist_scale[f] for _, f in program.unknown_twists] + [*robot.joint_units]
+    _, s, V = np.linalg.svd(rows / lengths, full_matrices=True)
+    motions = V[count_rank(s) :, -program.n_joints :] / robot.joint_units
+    moved = motions @ sums.weights[0, :count].T * robot.drive_units[:count]
+    _, _, order = qr(moved, mode="economic", pivoting=True)
+    return np.sort(order[: len(moved)])
 
 
 def _compute_chain_size(stages: Sequence[Stage]) -> float:
@@ -551,8 +626,9 @@ def _join_programs(stages: Sequence[Stage], size: float) -> Program:
     return Program(tuple(groups), tuple(range(len(AXES))), size, first, joints, others=others)
 
 
-def _check_chain(robot: Mechanism, home: State) -> None:
-    """Refuse a chain whose actuators do not set the controlled coordinates one by one."""
+def _check_drives_of_pose(robot: Mechanism) -> None:
+    """Refuse actuators that do not set the controlled coordinates one by one at home."""
+    home = robot.home_state
     names = [actuator.name for actuator in robot.actuators]
     for held in robot.assembly.held:
         if held not in names:
@@ -560,8 +636,7 @@ def _check_chain(robot: Mechanism, home: State) -> None:
             raise MechanismError(f"`held:` names {held!r}, which is not an actuator{hint}")
     moving = find_carrying_actuators(robot)
     values = robot.values[None]
-    _, tau = robot.slots(values)
-    q = readings_from_joints(driven_values(robot.program, home), tau, robot.slots.constants)
+    q = compute_readings(robot, values, home)
     D = differentiate_pose(robot, values, q, home).readings[0, 0][:, moving]
     scaled = D * robot.twist_scale[:, None] / robot.drive_units[moving]
     freedoms = count_rank(np.linalg.svd(scaled, compute_uv=False))

@@ -138,10 +138,11 @@ def determine_platform(robot: Mechanism) -> bool:
 
 def moves_by_drives(robot: Mechanism) -> bool:
     """Return whether inverse kinematics solves for the drives: each freed, those of a chain would
-    close no loop, and an actuator of loops that may stay open would take a part of the gap.
+    close no loop, an actuator of loops that may stay open would take a part of the gap, and spare
+    ones would be free.
     """
     is_open = robot.program.may_stay_open and not robot.has_redundant_sums
-    return bool(robot.stages) or is_open
+    return bool(robot.stages or robot.assembly.held) or is_open or has_spare_drives(robot)
 
 
 # Inverse kinematics by the forward one: Newton's method on the driven joints, c(T(u)) = c*.
@@ -245,7 +246,7 @@ class _Rows:
                     weights, own = sums.weights, sums.complete(u[:, None, stage.actuators])
                 state = Loops(robot, e, weights).close(own, next(loops), follow=False)
                 by_drive = differentiate_by_drives(robot, e, own, state, weights)[:, 0]
-                moved.append((state.T[:, 0], by_drive[..., : sums and sums.chosen]))
+                moved.append((state.T[:, 0], by_drive))
                 states.append(state)
                 ok &= state.status[:, 0] == CONVERGED
             bases, platforms = locate_stage_bases(stages, [T for T, _ in moved])
@@ -262,8 +263,9 @@ class _Rows:
                 vectors = by_drive.reshape(len(by_drive), 2, 3, -1)
                 turned, shifted = np.moveaxis(bases[i][..., None, :3, :3] @ vectors, 1, 0)
                 shifted = shifted - geometry.hat(T[..., :3, 3] - platforms[i][..., :3, 3]) @ turned
-                place = slice(drives.start, drives.start + by_drive.shape[2])
-                D[..., place] = np.concatenate([turned, shifted], axis=1)
+                own, sums = np.concatenate([turned, shifted], axis=1), self.sums[i]
+                places = np.arange(own.shape[2]) if sums is None else sums.places
+                D[..., drives.start + places] = own[..., : len(places)]
             axes, arms = joints[..., :3, 2], T[..., None, :3, 3] - joints[..., :3, 3]
             turning = axes * self.turns[:, None]
             moving = advance[..., None] * axes + np.cross(turning, arms)
@@ -314,7 +316,9 @@ class _Rows:
         """
         beyond = (now.sign != self.sign) & (self.sign != 0.0)
         for stage, tau in zip(self.robot.blocks, self.terms, strict=True):
-            triangles = find_triangles(tau)
+            triangles, chosen = find_triangles(tau), stage.robot.determining_readings
+            if chosen is not None:
+                triangles = np.intersect1d(triangles, chosen)
             if len(triangles):
                 u = _select_drives(stage, now.u)
                 weights = select_weights(tau, stage.robot.slots.constants)
@@ -409,8 +413,8 @@ def _solve_by_drives(
     """Return states (t, n) at controlled coordinates (t | 1, n, c) by the values of the drives;
     marks rows that fail.
 
-    Rows of a single stage begin with each joint free, which is almost right where loops may stay
-    open, and at the start where the orientation follows the position. Without `follow`, rows that
+    Rows of loops that may stay open begin with each joint free, which is almost right, and at the
+    start where the orientation follows the position. Without `follow`, rows that
     fail are not solved again along a path.
     """
     t, n = max(len(values), len(target)), target.shape[1]
@@ -425,7 +429,8 @@ def _solve_by_drives(
     first = begin.select((t, n), *np.divmod(np.arange(t * n), n))
     start = _begin(rows, first)
     rows = replace(rows, sign=start.sign)
-    last = rows.iterate(start if robot.stages else _begin_near_targets(rows, start, first))
+    is_open = robot.program.may_stay_open and not robot.stages
+    last = rows.iterate(_begin_near_targets(rows, start, first) if is_open else start)
     wrong = np.flatnonzero(last.status != CONVERGED)
     if follow and len(wrong):
         last = last.put(wrong, _follow_path(rows.select(wrong), start.take(wrong)))
@@ -446,15 +451,17 @@ def _solve_by_drives(
 def _make_rows(robot: Mechanism, values: FloatArray, target: FloatArray) -> _Rows:
     """Return rows with values (1 | R, p) and targets (R, c)."""
     slots, links, sums, turns = list[tuple[FloatArray, ...]](), [], [], list[bool]()
+    robot = robot.exact
     for stage in robot.blocks:
         own, assembly = values[:, stage.parameters], stage.robot.assembly
         slots.append(stage.robot.slots(own))
         is_serial, has_sums = stage.robot.is_serial, stage.robot.has_open_sums
-        has_sums |= bool(assembly.couplings)
+        chosen = stage.robot.determining_readings
+        has_sums |= bool(assembly.couplings) or chosen is not None
         links.append(
             place_serial(stage.robot.program.groups[0], slots[-1][0]) if is_serial else None
         )
-        sums.append(list_open_sums(stage.robot, own) if has_sums else None)
+        sums.append(list_open_sums(stage.robot, own, chosen) if has_sums else None)
         drives = [(name,) for name in assembly.driven_joints]
         if has_sums:
             drives = [actuator.driven_joints for actuator in assembly.actuators]
@@ -501,8 +508,9 @@ def _begin(rows: _Rows, first: State) -> _Iterate:
     for stage, own, sums in zip(rows.robot.blocks, states, rows.sums, strict=True):
         joints = driven_values(stage.robot.program, own)
         joints = joints if sums is None else sums.read(joints)
-        begin = stage.actuators.start  # a condition behind the joints moves none
-        u[:, begin : begin + joints.shape[2]] = joints[:, 0]
+        # a condition behind the joints moves none
+        places = np.arange(joints.shape[2]) if sums is None else sums.places
+        u[:, stage.actuators.start + places] = joints[:, 0]
         if not stage.robot.is_serial:
             loops.append(own)
     return rows.evaluate(u, tuple(loops))

@@ -124,7 +124,7 @@ class Loops(NamedTuple):
         goal: State | None = None,
     ) -> State:
         """Solve like `forward_trials` for values of joints or their sums (t | 1, n, a)."""
-        if self.weights is not None and not self.robot.has_open_sums:
+        if self.weights is not None and self.robot.are_joints(self.weights):
             joints = apply_weights(invert_weights(self.weights), values)
             return self._replace(weights=None).close(joints, start, follow, goal)
         begin = clear_sign(self.robot, start or self.robot.home_state)

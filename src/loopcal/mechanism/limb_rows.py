@@ -27,6 +27,11 @@ def name_passive_joints(robot: Mechanism) -> tuple[str, ...]:
     return tuple(f"{limb.name}.{joint.name}" for limb, joint in robot.assembly.passive_joints)
 
 
+def name_entries(body: str) -> tuple[str, ...]:
+    """Return the names of the twelve numbers of the pose of a body, [R t] row by row."""
+    return tuple(f"{body}:T{row}{column}" for row in (1, 2, 3) for column in (1, 2, 3, 4))
+
+
 def solve_passive_motion(U: FloatArray, right: FloatArray) -> FloatArray:
     """Return -U^-1 right for upper triangular U (t, n, u, u) and right (t, n, u, c); a pivot of
     zero gives infinities or NaN.

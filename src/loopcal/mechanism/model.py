@@ -271,6 +271,8 @@ class Mechanism(DrawnResult):
     stages : of a chain, each behind its parent; the last one carries the end platform. The program
         and the slots of a chain are those of all stages, one after the other; an engine computes
         the stages one by one.
+    independent : places of readings that determine the others, all without redundant ones; None of
+        chains, serial limbs, and a machine whose home is not known.
     """
 
     assembly: Assembly
@@ -284,6 +286,7 @@ class Mechanism(DrawnResult):
     findings: tuple[Finding, ...] = ()
     record: Any = None
     stages: tuple[Stage, ...] = ()
+    independent: IntArray | None = None
 
     FIELDS: ClassVar[tuple[Field, ...]] = (
         Field("value", lambda robot: robot.list_shown(robot.values), "parameter"),
@@ -347,6 +350,12 @@ class Mechanism(DrawnResult):
         unit = self.get_unit(dimension)
         return Quantity(value / unit.factor_to_si, unit.symbol)
 
+    def describe_gap(self, gap: float) -> Quantity:
+        """Return the gap [m] of loops; of bodies that only rotate it is an angle times the size."""
+        if all(freedom < 3 for freedoms in self.program.nodes for freedom in freedoms):
+            return self.to_quantity(gap / self.size, Dimension.ANGLE)
+        return Quantity(gap * 1e3, "mm")
+
     @property
     def stated_sigma(self) -> FloatArray:
         """Standard deviations (a,) of the readings [SI]; 0 where the robot states none."""
@@ -383,6 +392,22 @@ class Mechanism(DrawnResult):
         counts = len(self.parameters), len(self.actuators), len(self.program.groups)
         whole = (slice(0, count) for count in counts)
         return self.stages or (Stage(self.name, -1, np.eye(4), self, *whole),)
+
+    @property
+    def determining_readings(self) -> IntArray | None:
+        """Places of the readings that determine redundant others; None where there are none."""
+        chosen = self.independent
+        return None if chosen is None or len(chosen) == len(self.actuators) else chosen
+
+    @property
+    def exact(self) -> Mechanism:
+        """The same robot with loops that close exactly and redundant readings that follow them."""
+        if self.stages:
+            stages = tuple(replace(stage, robot=stage.robot.exact) for stage in self.stages)
+            return replace(self, stages=stages)
+        if self.determining_readings is None:
+            return self
+        return replace(self, program=replace(self.program, sigma=None, may_stay_open=False))
 
     @cached_property
     def is_serial(self) -> bool:
@@ -437,6 +462,12 @@ class Mechanism(DrawnResult):
         rows, readings = self.assembly.rows, len(self.assembly.rows) - len(self.assembly.couplings)
         is_square = self.program.n_joints == len(rows) and readings <= len(self.freedoms)
         return self.has_sums and not self.stages and not is_square
+
+    def are_joints(self, weights: FloatArray) -> bool:
+        """Return whether sums of weights (t | 1, r, J) determine the driven joints, whatever the
+        loops.
+        """
+        return weights.shape[1] == self.program.n_joints and not self.has_open_sums
 
     @property
     def has_redundant_sums(self) -> bool:

@@ -28,14 +28,9 @@ from loopcal.mechanism.actuation import (
     differentiate_unknowns_by_sums,
     drive_joints,
 )
-from loopcal.mechanism.chains import (
-    each_stage,
-    get_platforms,
-    name_platform_entries,
-    transport_to_end,
-)
+from loopcal.mechanism.chains import each_stage, locate_bodies, transport_to_end
 from loopcal.mechanism.least_squares_closure import differentiate_unknowns, list_unknown_joints
-from loopcal.mechanism.limb_rows import move_passive_joints, name_passive_joints
+from loopcal.mechanism.limb_rows import move_passive_joints, name_entries, name_passive_joints
 from loopcal.mechanism.model import Mechanism, ParameterUnits
 from loopcal.mechanism.states import is_closed
 from loopcal.mechanism.transmission import apply_weights, invert_weights
@@ -150,7 +145,7 @@ def differentiate_by_drives(
     """Return twists (t, n, 6, u) per unit of driven joints u (t, n, u), or (t, n, 6, r) of their
     sums with `weights` (t | 1, r, J), of a robot without stages at displacements e (t | 1, d).
     """
-    if weights is not None and not robot.has_open_sums:
+    if weights is not None and robot.are_joints(weights):
         inverse = invert_weights(weights)
         joints = apply_weights(inverse, u)
         by_joints = differentiate_by_drives(robot, e, joints, state, None)
@@ -230,20 +225,34 @@ def differentiate_passive_joints(
     return PassiveSensitivity(names, by_inputs[..., :p], by_inputs[..., p:])
 
 
+def differentiate_bodies(
+    robot: Mechanism, values: FloatArray, q: FloatArray, state: State, names: Sequence[str]
+) -> dict[str, Derivatives]:
+    """Differentiate bodies of `locate_bodies` as `differentiate_pose` the platform, by name."""
+    if robot.stages:
+        ends = [stage.name for stage in robot.stages]
+        parts = ((name, ends.index(name)) for name in names)
+        given = robot, values, q, state
+        return {name: differentiate_platform(*given, end=end) for name, end in parts}
+    bodies = list(robot.assembly.bodies) if names else []
+    whole = differentiate_pose(robot, values, q, state, nodes=1 + len(bodies))
+    rows = {name: slice(6 * i, 6 * i + 6) for i, name in enumerate(bodies, 1)}
+    return {name: Derivatives(*(by[:, :, rows[name]] for by in whole)) for name in names}
+
+
 def differentiate_sensed_values(
     robot: Mechanism, values: FloatArray, q: FloatArray, state: State, names: Sequence[str]
 ) -> PassiveSensitivity:
-    """Differentiate passive joints and the numbers of platforms of stages, by name."""
+    """Differentiate passive joints and the numbers of bodies, by name."""
     known: list[str] = []
     derivatives: list[tuple[FloatArray, FloatArray]] = []
-    for i, stage in enumerate(robot.stages):
-        entries = name_platform_entries(stage.name)
-        if not set(entries).isdisjoint(names):
-            known += entries
-            # a column r of the rotation moves by omega x r, the origin by v
-            slope = geometry.differentiate_entries(get_platforms(robot, state)[i])
-            twist = differentiate_platform(robot, values, q, state, end=i)
-            derivatives.append((slope @ twist.parameters, slope @ twist.readings))
+    poses = locate_bodies(robot, state)
+    bodies = [body for body in poses if not set(name_entries(body)).isdisjoint(names)]
+    for body, twist in differentiate_bodies(robot, values, q, state, bodies).items():
+        known += name_entries(body)
+        # a column r of the rotation moves by omega x r, the origin by v
+        slope = geometry.differentiate_entries(poses[body])
+        derivatives.append((slope @ twist.parameters, slope @ twist.readings))
     if not set(names) <= set(known):
         joints = differentiate_passive_joints(robot, values, q, state)
         known += joints.names

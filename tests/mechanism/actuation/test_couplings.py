@@ -547,7 +547,6 @@ def test_a_coupled_chain_refuses_what_it_cannot_be(tmp_path: Path) -> None:
     for old, new, sentence in (
         ("drive: none, start: -0.2, errors: [x]", "drive: none, errors: [gain]", "has no drive"),
         ("elbow.serial.joint: 0.5", "elbow.joint: 0.5", "'elbow.joint', which is neither"),
-        ("couplings:", "held: [slide]\ncouplings:", "With couplings every drive moves"),
         ("of: length, sum", "of: length, condition: temperature, sum", "does not state"),
         ("    family: gough\n", "    family: gough\n    tool: {z: 0.1}\n", "states a tool"),
     ):

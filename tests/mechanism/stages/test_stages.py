@@ -16,15 +16,23 @@ from scipy.stats import chi2
 from loopcal import geometry
 from loopcal.errors import DataError, FileError, MechanismError
 from loopcal.estimate.identification import identify
+from loopcal.estimate.options import FitOptions
+from loopcal.estimate.penalties import MAP
 from loopcal.io.robot.robot_file import list_shipped_robots, load_robot
 from loopcal.measure.instrument import Gaussian, Instrument, Sensor
 from loopcal.measure.kinds.poses import Pose
 from loopcal.measure.simulation import sample_truth, simulate
+from loopcal.mechanism.chains import locate_bodies
 from loopcal.mechanism.kinematics import compute_limb_frames, forward_trials
+from loopcal.mechanism.limb_rows import name_entries
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.modes import find_assembly_modes, find_working_modes
 from loopcal.mechanism.platform_coordinates import read_coordinates
-from loopcal.mechanism.sensitivity import differentiate_passive_joints, differentiate_pose
+from loopcal.mechanism.sensitivity import (
+    differentiate_passive_joints,
+    differentiate_pose,
+    differentiate_sensed_values,
+)
 from loopcal.mechanism.singularities import analyze_singularity
 from loopcal.mechanism.solutions import forward, inverse
 from loopcal.mechanism.states import Status
@@ -32,6 +40,7 @@ from loopcal.mechanism.workspace import sample_workspace
 from loopcal.report.scene.scene import list_parts
 from tests.denavit_hartenberg import multiply_denavit_hartenberg
 from tests.jacobians import check_jacobian
+from tests.mechanism.derivatives import check_pose_derivatives
 from tests.zoo import load_cached_robot
 
 Array = NDArray[np.float64]
@@ -636,3 +645,83 @@ def test_a_leg_with_closed_knee_and_ankle_is_calibrated(leg: Mechanism) -> None:
     assert np.abs(error).max() < 4.0
     low, high = chi2.ppf([0.005, 0.995], fit.residual_test.dof)
     assert low < fit.chi_square < high
+
+
+# --- more drives than freedoms and than coordinates
+
+POINTS = {
+    "l1": ([250, -20, 0], [92, -120, 0]),
+    "l2": ([250, 20, 0], [92, 120, 0]),
+    "l3": ([-108, 226, 0], [58, 140, 0]),
+    "l4": ([-142, 206, 0], [-150, 20, 0]),
+    "l5": ([-142, -206, 0], [-150, -20, 0]),
+    "l6": ([-108, -226, 0], [58, -140, 0]),
+    "l7": ([0, 0, 0], [40, 30, 20]),
+}
+LEGS = "\n".join(
+    f"      - {{name: {name}, tip: {tip}, attach: {attach}, ending: distance, actuated: {name},\n"
+    "         errors: [{of: base, shift: [x, y], tolerance: {sd: 0.1}}]}"
+    for name, (tip, attach) in POINTS.items()
+)
+TURNED = f"""controlled: [x, y, z, roll, pitch, yaw]
+stages:
+  - name: turntable
+    joint: {{kind: R, stroke: [-180, 180], errors: [x, y, rx, ry]}}
+  - name: column
+    joint: {{kind: P, axis: z, stroke: [-50, 50], errors: [offset]}}
+  - name: hexapod
+    mount: {{z: 120}}
+    family: limbs
+    controlled: [x, y, z, roll, pitch, yaw]
+    home: {{z: 300}}
+    drives: {{l: {{reads: length, stroke: [250, 450], sigma: 0.01}}}}
+    limbs:
+{LEGS}
+tolerances: {{lengths: {{sd: 0.1}}, angles: {{sd: 0.02}}}}
+workspace: {{x: [-50, 50], y: [-50, 50], z: [380, 460], roll: [-9, 9], pitch: [-9, 9], yaw: [-99, 99]}}
+"""  # noqa: E501
+WARM = TURNED.replace("stroke: [-50, 50], errors: [offset]", "drive: none") + (
+    """conditions: {temperature: {reference: 20, range: [15, 35]}}
+couplings:
+  grow: {of: length, sum: {column.serial.joint: 1}, condition: temperature, slope: 0.003}
+"""
+)
+SPARE = {"chain": TURNED, "coupled": WARM}
+
+
+@pytest.mark.parametrize("name", SPARE)
+def test_a_redundant_leg_and_a_turntable_are_spare_drives(name: str, tmp_path: Path) -> None:
+    robot = load_text(tmp_path, SPARE[name])
+    reached = sample_workspace(robot, 100, seed=3).solution
+    q, T = reached.q, reached.T
+    assert np.ptp(q[:, 0]) > 1.0  # the turntable takes a part of the yaw
+    legs = q[:, 2:9] if name == "chain" else q[:, 1:8]
+    height = q[:, 1] if name == "chain" else 3e-6 * (q[:, 8] - 20)
+    base = Rotation.from_euler("z", q[:, [0]]).as_matrix()
+    for length, (tip, attach) in zip(legs.T, POINTS.values(), strict=True):
+        foot = base @ (np.array(tip) / 1e3) + np.outer(height + 0.12, [0, 0, 1])
+        head = T[:, :3, :3] @ (np.array(attach) / 1e3) + T[:, :3, 3]
+        assert_allclose(np.linalg.norm(head - foot, axis=1), length, rtol=0, atol=1e-9)
+    assert_allclose(forward(robot, q).T, T, rtol=0, atol=1e-9)
+    check_pose_derivatives(robot, q[None, :2])
+    body, state = "column", forward(robot, q[:2]).state
+    given = robot, robot.values[None], q[None, :2], state, name_entries(body)
+    sensed = differentiate_sensed_values(*given)
+    for i, step in enumerate(1e-6 * np.eye(q.shape[1])):
+        ends = (locate_bodies(robot, forward(robot, q[:2] + s * step).state) for s in (1, -1))
+        ahead, behind = (of[body][0, :, :3].reshape(2, 12) for of in ends)
+        assert_allclose(sensed.readings[0, ..., i], (ahead - behind) / 2e-6, rtol=0, atol=1e-8)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SPARE)
+def test_chains_with_spare_and_redundant_drives_are_as_accurate_as_stated(name, tmp_path):
+    robot = load_text(tmp_path, SPARE[name])
+    instrument = Instrument((Sensor(Pose("rotation-vector"), Gaussian(np.repeat(2e-5, 6))),))
+    poses, z = sample_workspace(robot, 30, seed=1).coordinates, []
+    options = FitOptions(method=MAP(), sigma_uncertainty=0.0)
+    for i, truth in enumerate(sample_truth(robot, 20, seed=2)):
+        data = simulate(robot.with_values(truth), poses, instrument, i)
+        fit = identify(robot, data, options=options)
+        z.append(np.linalg.solve(np.linalg.cholesky(fit.covariance), fit.estimate - truth))
+    assert 0.9 < np.sqrt(np.mean(np.square(z))) < 1.1  # 20 machines of 18 parameters: 1 +- 0.04

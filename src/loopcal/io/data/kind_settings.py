@@ -847,11 +847,11 @@ def _read_entry(
     from loopcal.measure.kinds.kind import BASE
 
     kind = read_kind(file, node, place).with_tool(robot.tool)
-    stages = [stage.name for stage in robot.stages]
-    if kind.of and not kind.is_of_base and kind.of not in stages:
-        known = f"a stage ({', '.join(stages)}), or base" if stages else "base"
-        hint = suggest_names(kind.of, [*stages, BASE])
-        sentence = f"{robot.name!r} has no stage {kind.of!r}{hint}; `of` is {known}"
+    bodies = [stage.name for stage in robot.stages] or list(robot.assembly.bodies)
+    if kind.of and not kind.is_of_base and kind.of not in bodies:
+        known = f"a stage or body ({', '.join(bodies)}), or base" if bodies else "base"
+        hint = suggest_names(kind.of, [*bodies, BASE])
+        sentence = f"{robot.name!r} has no stage or body {kind.of!r}{hint}; `of` is {known}"
         raise file.error(sentence, (*place, "of"))
     try:
         check_kinds(robot, (kind,))

@@ -243,10 +243,15 @@ def _write_tables(
     joints = tables.joints
     of_drive = [next(i for i, j in enumerate(joints) if j.drive == d) for d in range(drives)]
     names = robot.controlled
-    programs = [stage.robot.program for stage in robot.blocks]
-    stays_open, trust = any(p.may_stay_open for p in programs), np.ones(len(weights))
-    if robot.has_redundant_sums:
-        stays_open, trust = False, measure_sums(robot, weights[None])
+    robots = [stage.robot for stage in robot.blocks]
+    programs = [own.program for own in robots]
+    stays_open = any(own.program.may_stay_open and not own.has_redundant_sums for own in robots)
+    trust, ends = np.ones(len(weights)), np.cumsum([len(own.assembly.rows) for own in robots])
+    for own, end, last in zip(robots, ends, np.cumsum([p.n_joints for p in programs]), strict=True):
+        if own.has_redundant_sums:
+            rows = slice(end - len(own.assembly.rows), end)
+            columns = slice(last - own.program.n_joints, last)
+            trust[rows] = measure_sums(own, weights[None, rows, columns])
     is_given = len(robot.blocks) == 1 and determine_platform(robot) and not moves_by_drives(robot)
     is_given &= not stays_open
     closure, fixed = (
@@ -473,7 +478,7 @@ def _choose_agreement(robot: Mechanism) -> float:
     """Return the largest accepted difference of derivatives, of the largest one: rounding; where
     loops stay open that of differences; with open sums loopcal neglects gaps over the size.
     """
-    stages = [] if robot.has_redundant_sums else [stage.robot for stage in robot.blocks]
+    stages = [own for s in robot.blocks for own in [s.robot] if not own.has_redundant_sums]
     if any(stage.program.may_stay_open and stage.has_open_sums for stage in stages):
         return 1e-2
     return 1e-6 if any(stage.program.may_stay_open for stage in stages) else 1e-9

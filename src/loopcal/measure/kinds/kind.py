@@ -32,7 +32,7 @@ from loopcal import geometry
 from loopcal.errors import DataError
 from loopcal.measure.array_checks import set_fields
 from loopcal.measure.kinds.setup_parameters import SetupItem, encode_frame
-from loopcal.mechanism.chains import name_platform_entries
+from loopcal.mechanism.limb_rows import name_entries
 from loopcal.numerics.elimination import spread_columns, without_rounding
 from loopcal.numerics.statistics import find_distinct
 from loopcal.parameters import Parameter
@@ -179,7 +179,8 @@ class Kind(ABC):
         rows belong to one of several kinds.
     unknown : setup items that are unknown; "bias" stands for `bias_item`.
     measures_points : whether it measures targets, which may be fixed to the base (`of: base`).
-    of : the stage of a chain whose platform is measured, or "base"; empty for the end platform.
+    of : the body that is measured: the platform of a stage of a chain, one of `bodies:`, or "base";
+        empty for the end platform.
     """
 
     __dataclass_fields__: ClassVar[dict[str, Field[Any]]]  # every kind is a dataclass
@@ -287,9 +288,9 @@ class Kind(ABC):
     @property
     def sensed_joints(self) -> tuple[str, ...]:
         """Names of the j joints, driven or passive, whose values the residual depends on; of a
-        stage, the twelve numbers of its platform.
+        body, the twelve numbers of its pose.
         """
-        return name_platform_entries(self.of) if self.of not in ("", BASE) else ()
+        return name_entries(self.of) if self.of not in ("", BASE) else ()
 
     def stack_joints(self, joints: Mapping[str, FloatArray], rows: IntArray) -> FloatArray | None:
         """Return the values (.., r, j) of the sensed joints at the poses of rows (r,), from those

@@ -31,6 +31,7 @@ from loopcal.mechanism.families.placement import (
     join_errors,
     single_error,
     standard_deviation,
+    strip_number,
 )
 from loopcal.mechanism.transmission import (
     HARMONICS,
@@ -602,6 +603,8 @@ def place_rows(
     for key, coupling in couplings.items():
         reference, base = _find_reference(key, coupling, conditions), Actuator(key, coupling.GIVEN)
         for name, names in _name_joints(key, coupling, joints, known):
+            if name in coupled or name in stated:
+                raise coupling.refuse(key, f"has the name {name!r} of another row. Rename one")
             first = joints[next(iter(names.values()))]
             coupled[name] = PlacedRow(name, coupling, names, first, base, reference)
     for condition in conditions:
@@ -618,7 +621,8 @@ def place_rows(
         for name, names in _name_joints(key, stated[key], joints, known)
     }
     for name, joint in joints.items():
-        key = next((key for key in (name, joint.stated) if key in stated), None)
+        groups = (key for key in (joint.stated, strip_number(name)) if key not in joints)
+        key = next((key for key in (name, *groups) if key in stated), None)
         if not joint.is_passive and key not in sums and (key or not sums):
             keys[name] = key, {}
     if sums:  # the file states the order of the readings
@@ -633,7 +637,7 @@ def place_rows(
         drives[name] = PlacedRow(name, drive, names, joint, base)
         _check_drive(drives[name], drive)
     groups = {joint.stated for joint in joints.values() if not joint.is_passive}
-    refuse_idle_drives(stated, drives, groups.union(sums))
+    refuse_idle_drives(stated, drives, groups.union(sums, map(strip_number, drives)))
     used = {joint for row in (*coupled.values(), *drives.values()) for joint in row.weights}
     if used:
         driven = {name: of.limb for name, of in joints.items() if name in used or not of.is_passive}

@@ -164,7 +164,8 @@ def couple_stages(record: Stages, chain: Assembly) -> Assembly:
         limbs, rest = limbs + moved, rest[len(own.limbs) :]
     conditions = {name: of for name, of in record.conditions.items() if name not in FORCES}
     placed = [
-        PlacedLimb(limb, {j.name: np.eye(3) for j in limb.joints}, {}, limb.name) for limb in limbs
+        PlacedLimb(limb, {j.name: np.eye(3) for j in limb.joints}, {}, strip_number(limb.name))
+        for limb in limbs
     ]
     placed, _, rows = place_rows(placed, {}, (), record.couplings, conditions)
     errors = join_errors(map(row_errors, rows.values()))
@@ -363,11 +364,6 @@ class PlacedStages(Stages):
         is_coupled = bool(self.couplings) or any(name not in FORCES for name in self.conditions)
         for key, is_stated, remedy in (
             ("parameters", bool(self.parameters), "Give them in a stage that has a `family:`"),
-            (
-                "held",
-                is_coupled and bool(self.held),
-                "With couplings every drive moves. Leave it out",
-            ),
             ("home", self.home != PoseRecord(), "Give `start:` of a joint or `home:` of a stage"),
         ):
             if is_stated:
