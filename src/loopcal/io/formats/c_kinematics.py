@@ -59,6 +59,8 @@ NEAR = 0.02
 # Largest difference of poses [m, 1] that the test in the file accepts, for a robot of a meter or
 # less: it is the rounding of some hundred operations, times the amplification of the mechanism.
 AGREEMENT = 1e-12
+# Largest distance [m, rad] at which loopcal's iteration ends before coordinates, rounded up.
+CLOSE = 1e-8
 
 
 class _Joint(NamedTuple):
@@ -489,6 +491,8 @@ def _write_tests(robot: Mechanism, commanded: BoolArray) -> str:
     coordinates, solution = _draw_poses(robot)
     slopes = jacobian(robot, solution.q, solution)
     poses = slopes.solution.T
+    gap = read_coordinates(poses, robot.controlled) - coordinates
+    coordinates += np.where(np.abs(gap) < CLOSE, gap, 0.0)  # those of the readings, to rounding
     parts = [
         f"#define TESTS {len(poses)}",
         f"#define AGREEMENT {_write(AGREEMENT * max(1.0, robot.size))}",
