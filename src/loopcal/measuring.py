@@ -7,7 +7,7 @@ Given rows and words change the state and the files of the session; what they me
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -24,7 +24,7 @@ from loopcal.io.data.measurement_file import (
     load_measurements,
 )
 from loopcal.io.exports.conversion import read_sheet
-from loopcal.io.exports.growing_export import GrowingExport
+from loopcal.io.exports.growing_export import GrowingExport, read_new_rows
 from loopcal.io.formats.gcode_program import format_move
 from loopcal.io.runs.plan_folder import find_asked
 from loopcal.io.runs.session_folder import (
@@ -33,6 +33,7 @@ from loopcal.io.runs.session_folder import (
     USED,
     Journal,
     Visit,
+    convert_cells,
     read_visits,
     split_values,
     write_measurements,
@@ -73,6 +74,13 @@ COMMANDS = {
 
 Row = tuple[str, dict[str, str]]
 """Pose of a row of an export, empty for the suggested one, and its cells."""
+
+
+def make_pace(minutes: float | None, speed: float | None) -> Pace:
+    """Return how long poses take; `speed` [mm per minute] without `minutes` is a DataError."""
+    if speed is not None and minutes is None:
+        raise DataError(report_finding("session.speed-alone"))
+    return Pace(minutes) if speed is None else Pace(minutes, 1e-3 * speed)
 
 
 def prepare_session(
@@ -209,6 +217,16 @@ class MeasuringSession:
         self._write()
         self.chosen = None
         return True
+
+    def read_export(self) -> Iterator[Row]:
+        """Give the new rows of the export."""
+        if self.export is not None:
+            new, journal = read_new_rows(self.export), self.journal
+            self.export = new.export
+            self.say(*new.findings)
+            for row in new.rows:
+                cells = convert_cells(row, new.units, journal.sheet, journal.columns)
+                yield row.get("pose", ""), cells
 
     def _decide(self, word: str) -> bool:
         """Take the last row back, use it or leave it out; return whether there is one."""

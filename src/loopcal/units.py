@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Annotated, Any
@@ -264,6 +265,16 @@ def parse_quantity(
         )
     unit = find_unit(symbol, dimension)
     return to_si(value, replace(unit, offset=0.0) if is_difference else unit)
+
+
+def parse_goal(text: str) -> tuple[float, str]:
+    """Return a length or an angle in SI, and the quantity that it limits."""
+    with suppress(UnitError):
+        return parse_quantity(text, Dimension.ANGLE), "orientation"
+    try:
+        return parse_quantity(text, Dimension.LENGTH), "position"
+    except UnitError as error:
+        raise UnitError(f"{error}, or give an angle, such as 10urad") from None
 
 
 def to_si(value: float, unit: Unit) -> float:

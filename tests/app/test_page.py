@@ -138,6 +138,7 @@ def test_a_wrong_row_is_corrected_and_left_out_by_keyboard_alone(server, visit, 
     walk_to(tab, "Calibrate")
     tab.keyboard.press("Enter")
     stop_report(tab)
+    tab.wait_for_selector("#result-title:focus")
     assert tab.locator("#verdict.failed").count() == 1
     assert "Not calibrated" in tab.inner_text("#verdict")
     worst = tab.locator("#tables tbody tr").first
@@ -235,21 +236,25 @@ def test_stop_ends_the_work(server, visit, made) -> None:
 
 def test_wrong_files_get_a_sentence(server, visit, tmp_path) -> None:
     tab = visit(server)
-    large, binary = tmp_path / "large.csv", tmp_path / "binary.csv"
+    large, binary, text = (tmp_path / f"{name}.csv" for name in ("large", "binary", "text"))
+    text.write_text("pose,q1 [mm]\n1,2\n")
     with large.open("wb") as file:
         file.truncate(100_000_000)
     binary.write_bytes(bytes(range(256)))
     tab.set_input_files("#choose", large)
     tab.wait_for_selector("#alert:not(:empty)")
     assert "at most 50 MB" in tab.inner_text("#alert")
-    begin(tab, binary)
+    tab.set_input_files("#choose", binary)
+    tab.wait_for_selector("#alert:has-text('binary.csv')")
+    begin(tab, text)
     assert tab.inner_text("#alert") == ""
-    tab.click("#calibrate")
-    tab.wait_for_selector("#messages li")
-    assert "binary.csv" in tab.inner_text("#messages")
+    tab.focus("#calibrate")
+    tab.keyboard.press("Enter")
+    tab.wait_for_selector("#messages:focus li")  # the focus follows the work
+    assert "text.csv" in tab.inner_text("#messages")
     check(tab, 1200)
-    tab.click("[aria-label='Remove binary.csv']")
-    tab.wait_for_selector("[aria-label='Remove binary.csv']", state="detached")
+    tab.click("[aria-label='Remove text.csv']")
+    tab.wait_for_selector("[aria-label='Remove text.csv']", state="detached")
 
 
 def test_a_lost_connection_is_said_and_typed_values_stay(visit, start, tmp_path) -> None:
@@ -309,7 +314,7 @@ def test_the_companion_leads_to_a_calibration(visit, start, tmp_path) -> None:
         values[0] += 3.0 * (count == wrong) + 1e-4 * count  # noise, as repeats have
         for value in values:  # the first field has the focus
             if value is values[0]:
-                tab.locator("#row input").first.focus()
+                tab.wait_for_selector("[data-key='field 0']:focus")
             tab.keyboard.type(f"{value:.5f}")
             tab.keyboard.press("Tab" if value is not values[-1] else "Enter")
         count += 1
@@ -325,6 +330,7 @@ def test_the_companion_leads_to_a_calibration(visit, start, tmp_path) -> None:
             count -= 1
             wrong = -1
             tab.wait_for_selector(f"#visits tbody tr:nth-child({count + 1})", state="detached")
+            tab.focus("[data-key='field 0']")
         assert count < 40
     tab.set_viewport_size({"width": 390, "height": 844})
     check(tab, 390)

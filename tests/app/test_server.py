@@ -16,10 +16,12 @@ import psutil
 import pytest
 
 from loopcal.app.project import Project, clean_name, recognize
+from loopcal.cli.commands.session_commands import make_export
 from loopcal.cli.entry_point import main
 from loopcal.cli.hints import find_hint, load_hints
 from loopcal.errors import DataError, FileError
 from loopcal.findings import report_finding
+from loopcal.planning.companion import Pace
 from tests.app.conftest import EXAMPLE
 from tests.io.test_probe_reports import MARLIN, REPRAP
 
@@ -84,7 +86,6 @@ KINDS = {
     "maslow.yaml": ("Maslow_tlX: -27.6\n", "maslow"),
     "loops.yaml": ("closed_loop: []\n", "other"),
     "arm.urdf": ("<robot/>", "urdf"),
-    "picture.png": ("\x00\x89PNG", "log"),
 }
 
 
@@ -95,11 +96,67 @@ def test_the_kind_of_a_file_is_recognized(name: str, tmp_path) -> None:
     assert recognize(tmp_path / name) == kind
 
 
-def test_what_people_did_not_name_is_not_shown(tmp_path) -> None:
+def test_messages_name_what_people_gave(tmp_path) -> None:
     project = Project(tmp_path)
-    assert project.word(f"{tmp_path}/plan/measurements.csv:8: wrong") == (
-        "plan/measurements.csv:8: wrong"
-    )
+    project.add("config.g", REPRAP.encode())
+    for made, given in {
+        f"{tmp_path}/plan/measurements.csv:8": "sheet of the plan",
+        "session/measurements.csv:8": "measured rows",
+        "result/config.yaml:3": "config.g",
+        "result/run": "config.g",
+        "result/config.csv:3": "config.g",
+        "own.csv:3": "own.csv:3",
+    }.items():
+        assert project.word(f"{made}: wrong") == f"{given}: wrong"
+    project.add("console.log", b"G32 bed probe heights: 0.1")
+    assert project.word("result/config.csv:3: wrong") == "console.log: wrong"
+
+
+REFUSED = {
+    "photo.jpg": (b"\xff\xd8\xff\xe0\0\x10JFIF", "binary"),
+    "data.xlsx": (b"PK\3\4\x14\0", "archive"),
+    "logs.txt.gz": (b"\x1f\x8b\x08\0", "archive"),
+    "data.csv": ("pose,x [mm]\n".encode("utf-16"), "utf-16"),
+    "empty.csv": (b" \r\n", "empty"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_no_command_reads_is_refused_with_what_it_is(name: str, tmp_path) -> None:
+    project, (content, code) = Project(tmp_path), REFUSED[name]
+    with pytest.raises(FileError) as caught:
+        project.add(name, content)
+    assert (caught.value.code, caught.value.path) == (f"app.{code}", Path(name))
+    assert not project.chosen.kinds
+    assert not project.has(name)
+
+
+def test_files_that_are_not_used_are_named(tmp_path) -> None:
+    project = Project(tmp_path)
+    project.add("result.json", b"{}")
+    assert "result.json" in project.chosen.messages[0]
+    project.add("old.yaml", b"family: gough\n")
+    project.add("new.yaml", b"family: gough\n")
+    assert "new.yaml now, and not from old.yaml" in project.chosen.messages[0]
+    project.add("data.csv", b"pose\n")
+    project.add("console.log", b"text")
+    assert project.robot == "new.yaml"
+    assert project.describe()["unused"] == ["result.json", "old.yaml", "console.log"]
+    project.change(remove="new.yaml")
+    project.add("config.g", REPRAP.encode())  # whose log it is
+    assert project.describe()["unused"] == ["result.json", "old.yaml"]
+
+
+def test_a_pose_that_does_not_exist_is_not_left_out(tmp_path) -> None:
+    project = Project(tmp_path)
+    project.add("a.csv", b"pose,x [mm]\n1,2\n2,3\n")
+    with pytest.raises(DataError) as caught:
+        project.leave_out("7", True)
+    assert caught.value.code == "app.gone"
+    project.leave_out("2", True)
+    assert project.chosen.dropped == ["2"]
+    project.correct("a.csv", 3, 0, "two")  # its new name
+    assert project.chosen.dropped == []
 
 
 def test_macros_beside_a_configuration_are_logs_and_settings_stay_allowed_ones(tmp_path) -> None:
@@ -133,7 +190,7 @@ def test_what_is_given_decides_robot_data_and_commands_alike(tmp_path) -> None:
     assert (project.robot, project.data) == ("hex.yaml", [])
     with pytest.raises(DataError) as caught:
         project.calibrate()
-    assert caught.value.code == "app.incomplete"
+    assert caught.value.code == "app.no-data"
     assert list(project.plan("height", "9", "", "")) == ["plan"]
 
 
@@ -344,10 +401,12 @@ def run_script(project: Project, script: Path, text: str, stop_after: float = 60
     """Run a script in place of the commands of a calibration, perhaps stop it."""
 
     async def run() -> None:
-        project.work = asyncio.create_task(project.run(project.calibrate()))
-        await asyncio.wait([project.work], timeout=stop_after)
-        project.stop()
-        while project.process is not None:
+        work = project.work
+        work.begin(project.calibrate(), project.chosen)
+        assert work.task is not None
+        await asyncio.wait([work.task], timeout=stop_after)
+        work.stop(project.chosen)
+        while work.process is not None:
             await asyncio.sleep(0.01)
 
     script.write_text(f"#!/bin/sh\n{text}")
@@ -397,6 +456,66 @@ def test_another_plan_waits_until_measured_rows_are_removed(tmp_path) -> None:
         assert not project.describe()["is_begun"]
         assert project.data == ["measurements.csv"]
         assert "plan" in project.plan(*plan)
+
+
+SHEET = """# kind: position
+# noise: {"*": 20 um}
+pose,left [deg],right [deg],x [mm],y [mm],z [mm]
+1,120,60,,,
+2,110,50,,,
+3,130,70,,,
+"""
+
+
+def test_the_companion_takes_what_the_command_takes(tmp_path) -> None:
+    export = tmp_path / "points.txt"
+    given = {"follow": export, "profile": "leica", "unit": None, "decimal": None, "by_order": False}
+    (tmp_path / "project").mkdir()
+    project = Project(tmp_path / "project", make_export(given))
+    project.add("sheet.csv", SHEET.encode())
+    project.change(settings={"robot": "five-bar", "goal": "50um"})
+    for speed, code in [("fast", "session.no-number"), ("1000,5", "session.speed-alone")]:
+        project.change(settings={"speed": speed})
+        with pytest.raises(DataError) as caught:
+            project.measure()
+        assert caught.value.code == code
+    project.change(settings={"minutes": "2", "check-every": "7"})
+    assert project.measure() == {}
+    session = project.session
+    assert session is not None
+    assert session.task.pace == Pace(2.0, 1.0005)
+    assert session.task.check_every == 7
+    assert session.task.problem.options.goal == pytest.approx(50e-6)
+    for wrong in ("1,234.5", "1 234", "x"):
+        project.tell("", "1", ["270", wrong, "-"])
+        assert f"{wrong!r} is not a number" in str(project.said)
+    assert not session.journal.visits
+    project.tell("", "1", [" 1,5", "270.2", "-"])
+    export.write_text("2 10 270 0\n3 5")
+    project.follow()
+    project.follow()
+    taken = [(visit.pose, *visit.cells.values()) for visit in session.journal.visits]
+    assert taken == [("1", "1.5", "270.2", ""), ("2", "10", "270", "0")]
+    project.finish()
+
+
+@pytest.mark.slow
+def test_the_next_start_removes_the_folder_of_a_killed_server(start) -> None:
+    server = start()
+    begin_work(server)
+    (private,) = server.folder.iterdir()
+    assert private.stat().st_mode & 0o077 == 0
+    server.process.kill()
+    server.process.wait()
+    again = type(server)(server.folder)
+    try:
+        (other,) = server.folder.iterdir()
+        assert other != private
+        third = type(server)(server.folder)  # a living server keeps its own
+        assert third.end() == (0, "")
+        assert other.is_dir()
+    finally:
+        assert again.end() == (0, "")
 
 
 @pytest.mark.slow
@@ -538,8 +657,7 @@ def test_downloads_are_those_of_the_commands_byte_for_byte(start, tmp_path, monk
 
 
 WRONG = {
-    "binary.csv": bytes(range(256)) * 9,
-    "empty.csv": b"",
+    "latin.csv": "pose,x [mm] \u00e4\n".encode("latin-1"),
     "robot.csv": b"family: gough\n",
     "other.csv": b"pose,q1 [mm],q2 [mm]\n1,2,3\n",
 }

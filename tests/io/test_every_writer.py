@@ -17,7 +17,7 @@ LIBRARY |= {"mkstemp", "fdopen", "mkdir", "makedirs", "hardlink_to", "copy2", "N
 
 USES_LIBRARY = {
     "app/project.py": "makes the folders of a machine",
-    "cli/commands/app_commands.py": "makes the folder that --keep names",
+    "cli/commands/session_commands.py": "makes the folder that --keep names",
     "cli/entry_point.py": "the report of a defect is for people, and must not fail",
     "io/example_folders.py": "writes the files of a new folder",
     "io/core/outputs.py": "writes folders",

@@ -12,8 +12,9 @@ const LOST = "loopcal does not answer. Values that you type stay here; it is ask
 const ENDED = "loopcal has ended, or was started again. Open the address that it prints now.";
 
 const $ = (id) => document.getElementById(id);
+const SETTINGS = document.querySelectorAll("[data-setting]");
 const base = (path) => path.split("/").pop();
-let state = null, shown = {}, is_all = false, rows = null, is_wanted = false;
+let state = null, shown = {}, is_all = false, rows = null, is_wanted = false, cause = null;
 
 function h(tag, props = {}, ...children) {
   const { data, ...rest } = props;
@@ -79,8 +80,8 @@ function drawFiles() {
   const formats = Object.fromEntries(state.formats.map((name) => [name, `file of ${name}`]));
   const begun = () => h("li", {}, h("b", { textContent: "Rows that were measured here" }),
     h("button", { textContent: "Remove", ariaLabel: "Remove the rows that were measured here", data: { "data-key": "session" }, onclick: () => ask("discard") }));
-  draw("list", [state.kinds, state.is_begun], () => [state.is_begun ? begun() : null, ...Object.entries(state.kinds).map(([name, kind]) => h("li", {},
-    h("b", { textContent: name }),
+  draw("list", [state.kinds, state.unused, state.is_begun], () => [state.is_begun ? begun() : null, ...Object.entries(state.kinds).map(([name, kind]) => h("li", {},
+    h("b", { textContent: name }, state.unused.includes(name) ? h("span", { className: "soft", textContent: " not used" }) : null),
     choice({ ...KINDS, ...formats }, kind, { ariaLabel: `Kind of ${name}`, data: { "data-key": `kind ${name}` },
       onchange: (event) => ask("change", { kinds: { [name]: event.target.value } }) }),
     h("button", { textContent: "Remove", ariaLabel: `Remove ${name}`, data: { "data-key": name }, onclick: () => ask("change", { remove: name }) })))]);
@@ -89,7 +90,7 @@ function drawFiles() {
     h("input", { value: state.settings[key] ?? "", size: 12, onchange: (event) => ask("change", { settings: { [key]: event.target.value } }) }))));
   draw("robot", state.robots, () => ["", ...state.robots].map((name) => h("option", { value: name, textContent: name || "none" })));
   $("shipped").hidden = Boolean(state.robot) && !state.robots.includes(state.robot);
-  for (const select of document.querySelectorAll("[data-setting]"))
+  for (const select of SETTINGS)
     if (document.activeElement !== select) select.value = state.settings[select.dataset.setting] ?? "";
   const missing = [state.robot ? "" : "a machine", state.data.length ? "" : "measurements"].filter(Boolean);
   $("need").textContent = missing.length ? `Still needed: ${missing.join(" and ")}.` : "";
@@ -229,7 +230,18 @@ function drawProgress() {
   }));
 }
 
+// The focus leaves a control that is disabled or hidden for what takes its place.
+function keepFocus(focused) {
+  const is_there = (place) => place?.isConnected && !place.disabled && place.checkVisibility();
+  const now = document.activeElement;
+  if (focused === document.body || (is_there(now) && now !== document.body && now !== $("main"))) return;
+  if (state.progress) cause = focused;
+  const after = cause === $("calibrate") ? [$("result-title"), $("messages"), cause] : [cause, $("messages")];
+  [$("stop"), $("row").querySelector("input"), $("pose-title"), ...after, $("main")].find(is_there).focus();
+}
+
 function drawAll() {
+  const focused = document.activeElement;
   const name = state.program ?? state.robot;
   $("machine").textContent = name ? base(name) : "";
   document.title = name ? `${base(name)} - loopcal` : "loopcal";
@@ -238,6 +250,7 @@ function drawAll() {
   drawResult();
   drawSession();
   drawProgress();
+  keepFocus(focused);
   loadRows();
   if (is_wanted && !state.progress && "import" in state.pages) { // the machine's file has been read
     is_wanted = false;
@@ -261,18 +274,18 @@ for (const kind of ["dragover", "dragleave", "drop"]) document.addEventListener(
   $("drop").classList.toggle("over", kind === "dragover");
   if (kind === "drop") upload([...event.dataTransfer.files]);
 });
-for (const select of document.querySelectorAll("[data-setting]"))
+for (const select of SETTINGS)
   select.onchange = () => ask("change", { settings: { [select.dataset.setting]: select.value } });
 $("calibrate").onclick = () => ask("calibrate");
 $("stop").onclick = () => ask("stop");
-$("measure").onclick = async () => { is_wanted = !await ask("measure"); $("pose-title").focus(); };
-$("finish").onclick = () => ask("finish").then(() => $("calibrate").focus());
+$("measure").onclick = async () => { is_wanted = !await ask("measure"); };
+$("finish").onclick = () => { cause = $("calibrate"); ask("finish"); };
 $("sorted").onchange = loadRows;
 $("plan").onsubmit = (event) => { event.preventDefault(); ask("plan", Object.fromEntries(new FormData(event.target))); };
 $("row").onsubmit = async (event) => {
   event.preventDefault();
   if ($("row").ariaBusy === "true") return; // the values of this pose are on their way
-  const values = [...$("row").querySelectorAll("input")].map((field) => field.value.trim().replace(",", "."));
+  const values = [...$("row").querySelectorAll("input")].map((field) => field.value.trim());
   $("row").ariaBusy = "true";
   await ask("tell", { pose: state.session.pose, values });
   $("row").ariaBusy = "false";

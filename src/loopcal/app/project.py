@@ -6,47 +6,53 @@
     plan/, session/     a plan, and the rows that were measured of it or of a given sheet
     choices             what was chosen; files that are given have an ending
 
-Nothing is computed here: commands run as processes of their own, which can be stopped; the
-companion is `loopcal.measuring`, as on the terminal.
+Nothing is computed here: commands run as processes of their own (`loopcal.app.work`); the companion
+is `loopcal.measuring`, as on the terminal.
 """
 
 from __future__ import annotations
 
-import asyncio
-import math
 import os
 import re
 import shutil
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from inspect import signature
 from pathlib import Path
 from typing import Any, get_args, get_origin, get_type_hints
 
-import psutil
-
+from loopcal.app.rows import correct_cell, list_rows
+from loopcal.app.work import Said, Work
 from loopcal.errors import DataError, FileError
 from loopcal.findings import Finding, report_finding
-from loopcal.io.core.csv_table import Cells, format_header, format_row, read_template
+from loopcal.io.core.csv_table import parse_finite, read_template
 from loopcal.io.core.limits import UPLOAD_SIZE, UPLOADS, make_name
-from loopcal.io.core.text_file import read_json, read_text, to_json, write_bytes, write_text
+from loopcal.io.core.text_file import read_json, to_json, write_bytes, write_text
 from loopcal.io.data.columns import HELD_OUT
+from loopcal.io.data.kind_settings import KindRows
+from loopcal.io.exports.growing_export import GrowingExport
 from loopcal.io.formats import FORMATS
 from loopcal.io.formats.import_export import list_formats, recognize_format
 from loopcal.io.robot.robot_file import list_shipped_robots
-from loopcal.measuring import MeasuringSession
+from loopcal.io.runs.session_folder import open_session, read_typed
+from loopcal.measuring import MeasuringSession, make_pace, prepare_session
+from loopcal.planning.companion import CompanionTask
 from loopcal.results.notebook import render_html
-from loopcal.results.tables import Block, Table, choose_unit, format_in
-from loopcal.units import DISPLAY_UNITS
+from loopcal.results.tables import Block, Table
+from loopcal.units import parse_goal
 
 LONGEST = 200  # bytes of the name of a file
 HEAD = 200_000  # characters by which a file is recognized
 STATE, REPORT = "choices", "result/files/report.html"
 RUN, SESSION, SHEET = "result/run", "session/measurements.csv", "plan/measurements.csv"
 KINDS = ("robot", "data", "log", "closures", "other")  # of files that are no program's
+# First bytes of files that are no text in UTF-8 -> what they are.
+MARKS = {b"PK\3\4": "archive", b"\x1f\x8b": "archive", b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-16"}
 FIT = ("hold-out", "noise", "loss")  # options of `calibrate`
+CHECK_EVERY = CompanionTask.check_every
+MEASURE = ("goal", "minutes", "speed", "check-every")  # options of `measure`
 QUARTER = "0.25"  # of the poses, held out unless the data or a person say otherwise
 OPTIONS = {"length_unit": "unit", "home_height": "home-z"}  # of `import`, with other names
 # What an instrument measures -> options of `loopcal plan`.
@@ -92,6 +98,22 @@ def check_facts(maker: Callable[..., Any], facts: Any) -> dict[str, Any]:
     return facts
 
 
+def read_number(text: str | None, least: float = sys.float_info.min) -> float | None:
+    """Return a number that was typed, if there is one; DataError if it is below `least`."""
+    number = parse_finite(read_typed(text or "") or "")
+    if text and (number is None or number < least):
+        raise DataError(report_finding("session.no-number", text=repr(text)))
+    return number
+
+
+def check_text(name: str, content: bytes) -> None:
+    """Raise FileError for a file that no command reads, with what it is."""
+    code = next((code for mark, code in MARKS.items() if content.startswith(mark)), "")
+    if code or b"\0" in content or not content.strip():
+        code = code or ("binary" if content.strip() else "empty")
+        raise FileError(report_finding(f"app.{code}"), name)
+
+
 def recognize(path: Path) -> str:
     """Return the kind of a file: the name of a format, or one of `KINDS`."""
     with path.open(encoding="utf-8", errors="replace") as file:
@@ -106,29 +128,31 @@ def recognize(path: Path) -> str:
 
 
 @dataclass
-class Choices:
+class Choices(Said):
     """What people chose, and what commands said. kinds : file -> kind. settings : option -> value.
-    dropped : poses that are left out. pages, codes : command -> what it printed, as HTML, and its
-    exit code. is_measured : whether the rows of the session are the data. runs, edits : number of
-    calibrations, and of changes since the last one.
+    dropped : poses that are left out. is_measured : whether the rows of the session are the data.
+    runs, edits : number of calibrations, and of changes since the last one.
     """
 
     kinds: dict[str, str] = field(default_factory=dict)
     settings: dict[str, str] = field(default_factory=dict)
     dropped: list[str] = field(default_factory=list)
-    pages: dict[str, str] = field(default_factory=dict)
-    messages: list[str] = field(default_factory=list)
-    codes: dict[str, int] = field(default_factory=dict)
     is_measured: bool = False
     runs: int = 0
     edits: int = 0
 
 
 class Project:
-    """The files of one machine; `version` grows when a page is to be drawn again."""
+    """The files of one machine; `version` grows when a page is to be drawn again.
 
-    def __init__(self, folder: Path) -> None:
+    make_export : gives the export that the companion follows, for the kind of a sheet.
+    """
+
+    def __init__(
+        self, folder: Path, make_export: Callable[[KindRows], GrowingExport] | None = None
+    ) -> None:
         self.folder: Path = folder
+        self.make_export: Callable[[KindRows], GrowingExport] | None = make_export
         self.version: int = 0
         self.opened: ExitStack[bool | None] = ExitStack()
         if any(folder.iterdir()) and not self.has(STATE):
@@ -143,9 +167,7 @@ class Project:
         if not is_ours or any(path.is_symlink() for path in folder.rglob("*")):
             raise FileError(report_finding("app.choices"), folder / STATE)
         self.store()
-        self.progress: tuple[str, int, int] | None = None
-        self.work: asyncio.Task[None] | None = None
-        self.process: asyncio.subprocess.Process | None = None
+        self.work: Work = Work(folder, self.touch, self.store, self.word)
         self.session: MeasuringSession | None = None
         self.said: list[Block] = []
 
@@ -185,18 +207,20 @@ class Project:
         """Add a file, or replace that of its name."""
         name, kinds = clean_name(name), self.chosen.kinds
         UPLOADS.check(len({*kinds, name}), "page", name)
+        check_text(name, content)
         write_bytes(self.folder / name, content)
         kind = recognize(self.folder / name)
-        before = self.program if kind not in KINDS and self.program != name else None
-        is_macro = (
-            before is not None and kinds[before] == kind and "probes" in FORMATS[kind].read_options
-        )
+        alike = {"robot"} if kind == "robot" else FORMATS.keys() if kind in FORMATS else set()
+        before = next((n for n, of in kinds.items() if n != name and of in alike), None)
+        reads_macros = kind in FORMATS and "probes" in FORMATS[kind].read_options
+        is_macro = before is not None and kinds[before] == kind and reads_macros
         kinds[name] = "log" if is_macro else kind  # such as bed.g beside config.g
         self.chosen.is_measured &= kind != "data"
         self.forget()
-        if before is not None and not is_macro:
-            kinds[before] = "other"
-            text = report_finding("app.replaced", name=name, before=before)
+        if kind == "other" or (before is not None and not is_macro):
+            code = "unused" if before is None else "replaced"
+            kinds |= {} if before is None else {before: "other"}
+            text = report_finding(f"app.{code}", name=name, before=before)
             self.chosen.messages = [f"loopcal: note: {text}"]
             self.store()
 
@@ -209,8 +233,8 @@ class Project:
         self.chosen.settings |= {str(key): str(value) for key, value in settings.items()}
         if known.pop(remove, None):
             (self.folder / remove).unlink(missing_ok=True)
-        is_kept = not kinds and not remove and settings.keys() <= set(FIT)
-        self.store(edits=1) if is_kept else self.forget()
+        is_kept = not kinds and not remove and settings.keys() <= {*FIT, *MEASURE}
+        self.store(len(settings.keys() & set(FIT))) if is_kept else self.forget()
 
     def forget(self) -> None:
         """Remove what was made of files that have changed."""
@@ -222,7 +246,23 @@ class Project:
         """Keep what was chosen, and `edits` that the result does not contain."""
         self.chosen.edits += edits
         write_text(self.folder / STATE, to_json(asdict(self.chosen)))
+        self.touch()
+
+    def touch(self) -> None:
+        """Have pages drawn again."""
         self.version += 1
+
+    def word(self, text: object) -> str:
+        """Return a text with the names that people gave, in place of files that were made here."""
+        shown = str(text).replace(f"{self.folder}{os.sep}", "")
+        logs = self.list_files("log") + self.list_files("closures")
+        given = self.program or self.robot
+        names = {SESSION: "measured rows", SHEET: "sheet of the plan", RUN: given}
+        for made in self.imported:
+            names |= {f"{made}.yaml": given, f"{made}.csv": ", ".join(logs) or given}
+        for made, given in names.items():
+            shown = re.sub(rf"{re.escape(made)}(:\d+)?", lambda _, of=given: of, shown)
+        return shown
 
     # Commands: the functions return title -> words of those to run.
 
@@ -270,9 +310,10 @@ class Project:
 
     def _import(self, has_data: bool) -> dict[str, list[str]]:
         """Return the command that reads the program's file, unless it was read."""
-        if not self.robot or (has_data and not self.data):
-            missing = "measurement file" if self.robot else "robot"
-            raise DataError(report_finding("app.incomplete", missing=missing))
+        if not self.robot:
+            raise DataError(report_finding("app.no-robot"))
+        if has_data and not self.data:
+            raise DataError(report_finding("app.no-data"))
         is_inside = has_data and not (self.chosen.is_measured or self.list_files("data"))
         made = [self.robot, *self.data[: int(is_inside)]]
         if not self.program or not self.imported or all(map(self.has, made)):
@@ -294,119 +335,35 @@ class Project:
         options = FORMATS[kind].read_options if kind else ()
         return [key for key in options if key not in ("probes", "closures")]
 
-    async def run(self, steps: Mapping[str, Sequence[str]]) -> None:
-        """Run commands one after the other, until one refuses."""
-        pipe, chosen = asyncio.subprocess.PIPE, self.chosen
-        environment = {**os.environ, "LOOPCAL_PAGE": "html", "PYTHONIOENCODING": "utf-8"}
-        try:
-            chosen.messages = []
-            for title in steps:  # these pages go with the files that commands replace
-                chosen.pages.pop(title, None)
-                chosen.codes.pop(title, None)
-            self.store()
-            for title, words in steps.items():
-                self.progress = (title, 0, 0)
-                self.version += 1
-                command = (sys.executable, "-P", "-m", "loopcal", *words)
-                self.process = await asyncio.create_subprocess_exec(
-                    *command, cwd=self.folder, env=environment, stdout=pipe, stderr=pipe
-                )
-                assert self.process.stdout is not None
-                out = asyncio.create_task(self.process.stdout.read())
-                await self._listen(self.process.stderr)
-                page, code = (await out).decode(), await self.process.wait()
-                if code < 0:
-                    chosen.messages.append(f"loopcal: {report_finding('app.killed')}")
-                else:
-                    chosen.pages[title], chosen.codes[title] = page, code
-                if code not in (0, 2):
-                    return
-        finally:
-            if self.process is not None:  # it was stopped
-                await self.process.wait()
-            self.work = self.process = self.progress = None
-            with suppress(OSError, FileError):  # the folder may be gone
-                self.store()
-
-    async def _listen(self, stream: asyncio.StreamReader | None) -> None:
-        """Take progress and messages of a command."""
-        assert stream is not None
-        async for line in stream:
-            text = line.decode().rstrip("\r\n")
-            if text.startswith("\x1e"):  # see `loopcal.cli.terminal`
-                done, total, what = text[1:].split("\t")
-                self.progress = (what, int(done), int(total))
-            elif text:
-                self.chosen.messages.append(text)
-            self.version += 1
-
-    def stop(self) -> None:
-        """End the command that runs, and what it has started."""
-        if self.work is not None:
-            self.work.cancel()
-            self.chosen.messages.append(f"loopcal: note: {report_finding('app.stopped')}")
-        if self.process is not None:
-            with suppress(psutil.NoSuchProcess):
-                process = psutil.Process(self.process.pid)
-                for each in (*process.children(recursive=True), process):
-                    each.kill()
-
     # Rows
 
     def list_rows(self, most: int, is_sorted: bool) -> dict[str, Any]:
-        """Return the first rows of the measurement files, with the largest residual of each pose;
-        sorted by it, after rows that the result lacks.
-        """
-        from loopcal.estimate.result import residuals_from_arrays
-        from loopcal.io.runs.run_folder import read_run_folder
-
-        found, tables, held_out = dict[str, tuple[float, str]](), [], ()
-        if self.has(f"{RUN}/result.json"):
-            result, arrays = read_run_folder(self.folder / RUN)
-            held_out = (result.get("split") or {"held_out": ()})["held_out"]
-            excluded = result.get("fit", {}).get("dropped") or ()
-            for of in residuals_from_arrays(arrays):
-                for label, raw, white in zip(of.poses, of.raw, abs(of.whitened), strict=True):
-                    i = int(white.argmax())
-                    unit = choose_unit(DISPLAY_UNITS[of.dimensions[i]], [raw[i]])
-                    text = f"{of.components[i]} {format_in(unit, raw[i], 3)} {unit.symbol}"
-                    found[label] = max(found.get(label, (0.0, "")), (float(white[i]), text))
-            found = {label: of for label, of in found.items() if label not in excluded}
-        known, nothing = {*found, *held_out}, (0.0, "")
-        for name in filter(self.has, self.data):
-            table = read_template(self.folder / name)
-            places = zip(table.lines, table.pose_names(), table.rows, strict=True)
-            rows = [(*place, *found.get(place[1], (None, ""))) for place in places]
-            if is_sorted:
-                rows.sort(
-                    key=lambda row: -found.get(row[1], nothing)[0] if row[1] in known else -math.inf
-                )
-            facts = {"count": len(rows), "most": max([3.0, *(of[0] for of in found.values())])}
-            facts |= {"file": name, "header": format_header(table.units), "rows": rows[:most]}
-            tables.append(facts)
+        """Return the first rows of the measurement files."""
+        files = {name: self.folder / name for name in self.data if self.has(name)}
+        tables, held_out = list_rows(files, self.folder / RUN, most, is_sorted)
         return {"tables": tables, "held_out": held_out, "dropped": self.chosen.dropped}
 
     def correct(self, file: str, line: int, column: int, text: str) -> None:
-        """Replace a cell of a measurement file; FileError where it must be a number."""
+        """Replace a cell of a measurement file."""
         if file not in self.data:
             raise DataError(report_finding("app.gone"))
-        table, path, text = read_template(self.folder / file), self.folder / file, text.strip()
-        row, name = list(table.lines).index(line), table.names[column]
-        if table.units[name] is not None:
-            one = replace(table, columns={name: Cells([text])}, lines=[line])
-            one.scaled_numbers(name, 1.0)
-        cells = list(list(table.rows)[row])
-        cells[column] = text
-        lines = read_text(path, "measurement file").split("\n")
-        lines[line - 1] = format_row(cells) + "\r" * lines[line - 1].endswith("\r")
-        write_text(path, "\n".join(lines))
+        correct_cell(self.folder / file, line, column, text)
+        known = self._list_poses()  # one of them may have another name
+        self.chosen.dropped = [each for each in self.chosen.dropped if each in known]
         self.store(edits=1)
 
     def leave_out(self, pose: str, is_out: bool) -> None:
         """Leave a pose out of the next calibration, or use it again."""
+        if pose not in self._list_poses():
+            raise DataError(report_finding("app.gone"))
         others = [each for each in self.chosen.dropped if each != pose]
         self.chosen.dropped = others + [pose] * is_out
         self.store(edits=1)
+
+    def _list_poses(self) -> set[str]:
+        """Return the names of the poses in the measurement files."""
+        tables = [read_template(self.folder / name) for name in filter(self.has, self.data)]
+        return {label for table in tables for label in table.pose_names()}
 
     # Measuring
 
@@ -415,43 +372,64 @@ class Project:
         file is to be read.
         """
         import loopcal as lc
-        from loopcal.io.runs.session_folder import open_session
-        from loopcal.measuring import prepare_session
-        from loopcal.planning.companion import CompanionTask, Pace
 
         sheets = [name for name in (SHEET, *self.list_files("data")) if self.has(name)]
         if not sheets:
-            raise DataError(report_finding("app.incomplete", missing="sheet of a plan"))
+            raise DataError(report_finding("app.no-plan"))
         if self.session is not None:
             return {}
         if steps := self._import(has_data=False):
             return steps
         robot = lc.load_robot(self.folder / self.robot if self.has(self.robot) else self.robot)
+        goal, minutes, speed, check_every = map(self.chosen.settings.get, MEASURE)
         task, table, entry = prepare_session(
-            self.folder / sheets[0], robot, None, Pace(), CompanionTask.check_every
+            self.folder / sheets[0],
+            robot,
+            parse_goal(goal) if goal else None,
+            make_pace(read_number(minutes), read_number(speed)),
+            int(read_number(check_every, least=0.0) or 0) if check_every else CHECK_EVERY,
         )
         columns = [column.name for column in entry.kind.columns]
         with ExitStack() as stack:
             journal = stack.enter_context(open_session(self.folder / "session", table, columns))
-            session = MeasuringSession(task, journal, self._say)
+            export = self.make_export(entry) if self.make_export else None
+            session = MeasuringSession(task, journal, self._say, export)
             session.resume()
             session.choose_pose()
             self.opened, self.session = stack.pop_all(), session
         return {}
-
-    def word(self, text: object) -> str:
-        """Return a text without the folder, which people did not name."""
-        return str(text).replace(f"{self.folder}{os.sep}", "")
 
     def _say(self, *lines: Block | Finding) -> None:
         self.said += [line if isinstance(line, Table) else self.word(line) for line in lines]
 
     def tell(self, word: str = "", pose: str = "", values: Sequence[str] = ()) -> None:
         """Take a word, as the terminal does, or the values of a pose."""
-        if (session := self.session) is not None:
-            self.said, columns = [], session.journal.columns
-            if session.take(word or (pose, dict(zip(columns, values, strict=True)))):
-                session.choose_pose()
+        if (session := self.session) is None:
+            return
+        self.said, columns = [], session.journal.columns
+        cells = dict(zip(columns, map(read_typed, values), strict=False))
+        wrong = [v for v, cell in zip(values, cells.values(), strict=False) if cell is None]
+        if not word and (wrong or len(values) != len(columns)):
+            self._say(report_finding("session.no-number", text=repr(next(iter(wrong), ""))))
+        elif session.take(word or (pose, {n: cell or "" for n, cell in cells.items()})):
+            session.choose_pose()
+
+    def follow(self) -> None:
+        """Take the rows that the followed export got."""
+        session, said = self.session, self.said
+        if session is None or session.export is None:
+            return
+        self.said = []
+        try:
+            for row in session.read_export():
+                if session.take(row):
+                    session.choose_pose()
+        except (DataError, FileError) as error:
+            self._say(str(error))
+        if self.said:
+            self.touch()
+        else:
+            self.said = said
 
     def finish(self) -> None:
         """End measuring; the used rows become the data of the calibration."""
@@ -470,7 +448,10 @@ class Project:
     def describe(self) -> dict[str, Any]:
         """Return everything that a page shows, but rows."""
         program, session, shown = self.program, self.session, asdict(self.chosen)
-        shown |= {"robot": self.robot, "data": self.data, "progress": self.progress}
+        used = {program, self.robot, *self.data}
+        used |= {*self.list_files("log"), *self.list_files("closures")} if self.imported else set()
+        shown["unused"] = [name for name in self.chosen.kinds if name not in used]
+        shown |= {"robot": self.robot, "data": self.data, "progress": self.work.progress}
         shown |= {"robots": list(list_shipped_robots()), "questions": self._list_questions()}
         shown["formats"] = list_formats("read")
         shown |= {"program": program, "most": UPLOAD_SIZE.count, "session": None}

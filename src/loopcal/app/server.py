@@ -34,6 +34,8 @@ from loopcal.app.project import Project, check_facts
 from loopcal.errors import DataError, LoopcalError
 from loopcal.findings import report_finding
 from loopcal.io.core.limits import UPLOAD_SIZE
+from loopcal.io.data.kind_settings import KindRows
+from loopcal.io.exports.growing_export import POLL, GrowingExport
 
 TICK, HEARTBEAT = 0.1, 30  # seconds between looks; looks after which a page is told all again
 ROWS = (15, 2000)  # of a table that a page gets at first, and at most
@@ -162,7 +164,7 @@ class Handler(RequestHandler):
     async def post(self, name: str) -> None:
         """Do what the page asks for."""
         if name == "stop":
-            self.project.stop()
+            self.project.work.stop(self.project.chosen)
         elif name in ACTIONS:
             action, body = getattr(self.project, name), None
             with suppress(ValueError):  # None is refused
@@ -176,20 +178,34 @@ class Handler(RequestHandler):
         """Act on the project, once at a time, while others are answered; run the commands."""
         project = self.project
         async with self.settings["lock"]:
-            if project.work is not None:
+            if project.work.task is not None:
                 raise DataError(report_finding("app.busy"))
             if steps := await asyncio.to_thread(action):
-                project.work = asyncio.create_task(project.run(steps))
-            project.version += 1
+                project.work.begin(steps, project.chosen)
+            project.touch()
 
 
-async def serve(folder: Path, host: str, port: int, announce: Callable[[str, str], None]) -> None:
+async def follow(project: Project, lock: asyncio.Lock) -> None:
+    """Give the companion the rows of an export as they come."""
+    while True:
+        await asyncio.sleep(POLL)
+        async with lock:
+            await asyncio.to_thread(project.follow)
+
+
+async def serve(
+    folder: Path,
+    host: str,
+    port: int,
+    announce: Callable[[str, str], None],
+    make_export: Callable[[KindRows], GrowingExport] | None = None,
+) -> None:
     """Serve the project of a folder until the process is asked to end.
 
     announce : gets the address to print, and one that opens once, for the browser to start: other
-        users may see with which words it starts.
+        users may see with which words it starts. make_export : as of `Project`.
     """
-    project, ended = Project(folder), asyncio.Event()
+    project, ended, lock = Project(folder, make_export), asyncio.Event(), asyncio.Lock()
     token, once = secrets.token_urlsafe(24), secrets.token_urlsafe(24)
     try:
         sockets = bind_sockets(port, host)
@@ -199,7 +215,7 @@ async def serve(folder: Path, host: str, port: int, announce: Callable[[str, str
     port = sockets[0].getsockname()[1]
     facts = {"project": project, "token": token, "host": host.lower(), "ended": ended}
     facts |= {"once": {once}}
-    facts |= {"cookie": f"loopcal-{port}", "lock": asyncio.Lock(), "log_function": lambda _: None}
+    facts |= {"cookie": f"loopcal-{port}", "lock": lock, "log_function": lambda _: None}
     server = HTTPServer(Application([(r"/(.*)", Handler)], **facts), max_body_size=10**15)
     server.add_sockets(sockets)
     for name in ("SIGINT", "SIGTERM", "SIGHUP"):
@@ -211,10 +227,12 @@ async def serve(folder: Path, host: str, port: int, announce: Callable[[str, str
         shown = next((a for a in listed if re.fullmatch(r"(?!127\.)[\d.]+", a)), host)
     address = f"http://{shown}:{port}/?token="
     announce(address + token, address + once)
+    following = asyncio.create_task(follow(project, lock))
     try:
         await ended.wait()
     finally:
-        project.stop()
+        project.work.stop(project.chosen)
+        following.cancel()
         project.opened.close()
         server.stop()
         await asyncio.sleep(2 * TICK)  # pages that wait are told no more

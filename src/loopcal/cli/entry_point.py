@@ -37,7 +37,7 @@ from loopcal.output_record import record_outputs
 SECTIONS = {
     "Describe the robot": {
         "new": ("file", "Write a robot file, and a measurement file, to fill in."),
-        "app": ("app", "Calibrate and measure on a page in the browser."),
+        "app": ("session", "Calibrate and measure on a page in the browser."),
         "check": ("file", "Read a robot file and show what it contains."),
         "view": ("file", "Show a robot, or a calibration, as a 3-D view in the browser."),
         "schema": ("file", "Print the JSON Schema of a kind of file, for editors."),

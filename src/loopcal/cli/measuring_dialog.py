@@ -16,12 +16,9 @@ from contextlib import suppress
 from loopcal.cli.hints import with_hint
 from loopcal.cli.terminal import print_text, width
 from loopcal.findings import Finding
-from loopcal.io.exports.growing_export import GrowingExport, read_new_rows
-from loopcal.io.runs.session_folder import convert_cells
+from loopcal.io.exports.growing_export import POLL
 from loopcal.measuring import COMMANDS, MeasuringSession, Row
 from loopcal.results.tables import Block, render_text
-
-POLL = 0.5  # seconds between two looks at a followed export
 
 
 def print_lines(*lines: Block | Finding) -> None:
@@ -74,8 +71,7 @@ class Dialog(MeasuringSession):
 
         threading.Thread(target=read, daemon=True).start()
         while True:
-            if self.export is not None:
-                yield from self._follow(self.export)
+            yield from self.read_export()
             try:
                 line = lines.get(timeout=POLL)
             except queue.Empty:
@@ -84,12 +80,3 @@ class Dialog(MeasuringSession):
                 return
             if line:
                 yield line
-
-    def _follow(self, export: GrowingExport) -> Iterator[Row]:
-        """Give the new rows of the export."""
-        new, journal = read_new_rows(export), self.journal
-        self.export = new.export
-        self.say(*new.findings)
-        for row in new.rows:
-            cells = convert_cells(row, new.units, journal.sheet, journal.columns)
-            yield row.get("pose", ""), cells

@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import wraps
 from importlib import import_module
@@ -27,7 +26,7 @@ from loopcal.cli import terminal
 from loopcal.errors import DataError, LoopcalError, UnitError, suggest_names
 from loopcal.findings import report_finding
 from loopcal.registry import Registry
-from loopcal.units import Dimension, find_unit, parse_number, parse_quantity
+from loopcal.units import Dimension, find_unit, parse_goal, parse_number, parse_quantity
 
 if TYPE_CHECKING:
     from click.shell_completion import CompletionItem
@@ -194,16 +193,6 @@ def _quantity(dimension: Dimension, is_positive: bool = False) -> Parsed:
     return Parsed("quantity", parse, show)
 
 
-def _parse_goal(text: str) -> tuple[float, str]:
-    """Return a length or an angle in SI, and the quantity that it limits."""
-    with suppress(UnitError):
-        return parse_quantity(text, Dimension.ANGLE), "orientation"
-    try:
-        return parse_quantity(text, Dimension.LENGTH), "position"
-    except UnitError as error:
-        raise UnitError(f"{error}, or give an angle, such as 10urad") from None
-
-
 def _parse_condition(text: str) -> tuple[str, float]:
     """Return the name of a condition and its value [degC, s, N, Nm]."""
     name, _, value = text.partition("=")
@@ -232,7 +221,7 @@ Parts = tuple[tuple[str, Any], ...]  # of a volume, see `loopcal.apply.volume_ac
 FILE = click.Path(path_type=Path)
 LENGTH, POSITIVE_LENGTH = (_quantity(Dimension.LENGTH, positive) for positive in (False, True))
 ANGLE, POSITIVE_ANGLE = (_quantity(Dimension.ANGLE, positive) for positive in (False, True))
-GOAL = Parsed("quantity", _parse_goal)
+GOAL = Parsed("quantity", parse_goal)
 NAMES = Parsed("names", lambda text: tuple(text.split(",")), ",".join)
 CONDITION = Parsed("condition", _parse_condition)
 POSE_SHARE = Parsed("share", _parse_pose_share)

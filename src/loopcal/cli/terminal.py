@@ -74,8 +74,10 @@ def print_output(output: Output, as_json: bool) -> int:
         print_text(page)
     elif page and PAGE in os.environ:
         from loopcal.results.notebook import render_html
+        from loopcal.results.tables import COMMAND
 
-        print_text(render_html(page, style=""))
+        own = ("Written to ", COMMAND)  # files that the page lists, and what it has buttons for
+        print_text(render_html([b for b in page if not str(b).startswith(own)], style=""))
     elif page:
         from loopcal.results.tables import render_text
 

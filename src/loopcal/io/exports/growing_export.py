@@ -22,6 +22,8 @@ from loopcal.io.data.kind_settings import KindRows
 from loopcal.io.exports.conversion import Row, read_points
 from loopcal.io.exports.profile import Profile
 
+POLL = 0.5  # seconds between two looks at an export that is followed
+
 
 @dataclass(frozen=True)
 class GrowingExport:

@@ -209,6 +209,12 @@ def write_measurements(folder: Path, sheet: Table, visits: Sequence[Visit]) -> N
         (folder / DATA).unlink(missing_ok=True)
 
 
+def read_typed(word: str) -> str | None:
+    """Return a typed number, also with a decimal comma; empty for `-`, None for what is none."""
+    number = "" if word.strip() == "-" else word.strip().replace(",", ".", 1)
+    return number if not number or parse_finite(number) is not None else None
+
+
 def split_values(text: str, count: int) -> tuple[str, list[str] | None]:
     """Return the pose that a typed line names, empty for none, and its `count` numbers; None where
     the line is no row. A `-` stands for a value that was not measured.
@@ -220,9 +226,8 @@ def split_values(text: str, count: int) -> tuple[str, list[str] | None]:
     if len(words) not in (count, count + 1):
         words = [word.strip() for word in text.split(",")]
     name = words[0] if len(words) == count + 1 else ""
-    values = ["" if word == "-" else word.replace(",", ".", 1) for word in words[bool(name) :]]
-    is_row = len(values) == count and all(not v or parse_finite(v) is not None for v in values)
-    return name, values if is_row else None
+    values = [value for word in words[bool(name) :] if (value := read_typed(word)) is not None]
+    return name, values if len(values) == count == len(words) - bool(name) else None
 
 
 def convert_cells(
