@@ -119,7 +119,7 @@ def test_home_pose_outside_the_strokes_gives_a_warning(loopcal, tmp_path) -> Non
 FILE_CASES = [
     (b"", "is empty"),
     (b" \n\n", "is empty"),
-    (None, "is a folder, not a"),
+    (None, "is a folder. Name the"),
     ("# Länge\n".encode("latin-1"), "is not UTF-8 text (byte 0xe4). Save it as UTF-8"),
     (b"format: 1\0\n", "contains a zero byte"),
 ]

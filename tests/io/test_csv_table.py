@@ -46,9 +46,18 @@ def test_columns_are_read_in_si_units_with_nan_for_empty_cells(tmp_path) -> None
     assert (table.header_line, list(table.lines)) == (4, [5, 8])
 
 
-def test_byte_order_mark_and_windows_line_ends_are_accepted(tmp_path) -> None:
-    path = write(tmp_path, b"\xef\xbb\xbf" + GOOD.replace("\n", "\r\n").encode())
+@pytest.mark.parametrize("end", ["\r\n", "\r"])
+def test_byte_order_mark_and_line_ends_of_others_are_accepted(tmp_path, end) -> None:
+    path = write(tmp_path, b"\xef\xbb\xbf" + GOOD.replace("\n", end).encode())
+    table = read_table(path)
+    assert (table.header_line, list(table.lines)) == (4, [5, 8])
     assert read_all(path)[0].tolist() == pytest.approx([0.2335, 0.2345], rel=4e-16)
+
+
+def test_single_carriage_return_is_named(tmp_path) -> None:
+    path = write(tmp_path, GOOD.replace("p1,", "p1,\r").encode())
+    with pytest.raises(FileError, match=":5: this line contains a carriage return"):
+        read_table(path)
 
 
 def test_settings_are_read_from_a_sidecar_file(tmp_path) -> None:

@@ -168,7 +168,7 @@ def test_file_that_is_not_text_is_refused(
 
 
 def test_folder_and_missing_file_are_refused(tmp_path) -> None:
-    with pytest.raises(FileError, match="this is a folder, not a robot file"):
+    with pytest.raises(FileError, match=r"this is a folder\. Name the robot file in it"):
         read_yaml(tmp_path, "robot file")
     with pytest.raises(FileError, match="this robot file does not exist"):
         read_yaml(tmp_path / "absent.yaml", "robot file")

@@ -487,4 +487,7 @@ def _split_cells(path: Path, line: int, text: str) -> tuple[str, ...]:
     try:
         return tuple(cell.strip() for cell in next(csv.reader([text], strict=True)))
     except csv.Error as error:
+        if "\r" in text:
+            sentence = "this line contains a carriage return. Save the file with equal line ends"
+            raise FileError(sentence, path, line) from None
         raise FileError(f"not valid CSV ({error}). Correct the quotes", path, line) from None

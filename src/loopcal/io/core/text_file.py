@@ -349,18 +349,19 @@ def as_path(path: Any, what: str) -> Path:
         name = os.fsencode(path)
     except TypeError:
         given = type(path).__name__
-        sentence = f"the path of a {what} is of type {given}. Give a text or a pathlib.Path"
+        sentence = f"the path of the {what} is of type {given}. Give a text or a pathlib.Path"
         raise DataError(f"{sentence} (the order of savers is save_..(object, path))") from None
     except UnicodeEncodeError:
         name = b"\0"
     if b"\0" in name:
-        sentence = f"the path of a {what} contains a null character or half of a character"
+        sentence = f"the path of the {what} contains a null character or half of a character"
         raise DataError(f"{sentence}, which no file name can have. Correct the path")
     return Path(path)
 
 
 def read_text(path: str | Path, what: str, hint: str = "", limit: FileLimit = PROGRAM_SIZE) -> str:
-    """Return the text of a UTF-8 file without a byte order mark.
+    """Return the text of a UTF-8 file without a byte order mark. Lines that end as on an old Mac,
+    all by CR, end by LF.
 
     `what` it should be, such as "robot file", and a `hint` beside saving it as UTF-8 are for
     messages. FileError : see `read_bytes`; or the file is not UTF-8, or is empty.
@@ -379,7 +380,7 @@ def read_text(path: str | Path, what: str, hint: str = "", limit: FileLimit = PR
         raise FileError(sentence, path, line)
     if not text.strip():
         raise FileError(f"this {what} is empty. See the examples that come with loopcal", path)
-    return text
+    return text if "\n" in text else text.replace("\r", "\n")
 
 
 def read_bytes(path: str | Path, what: str, limit: FileLimit = PROGRAM_SIZE) -> bytes:
@@ -405,13 +406,13 @@ def open_bytes(path: str | Path, what: str) -> Iterator[BufferedReader]:
     path = as_path(path, what)
     try:
         if path.is_dir():  # not every system opens a folder
-            raise FileError(f"this is a folder, not a {what}. Name a file in it", path)
+            raise FileError(f"this is a folder. Name the {what} in it", path)
         # opening does not wait, as it would for a pipe, and what was opened is examined rather than
         # the name, which may denote another file a moment later
         with os.fdopen(os.open(path, OPEN_FLAGS), "rb") as stream:
             if not stat.S_ISREG(os.fstat(stream.fileno()).st_mode):
-                sentence = f"this is a device or a pipe, not a {what}. Save it as an ordinary file"
-                raise FileError(f"{sentence} and name that", path)
+                sentence = "this is a device or a pipe. Name an ordinary file"
+                raise FileError(f"{sentence} with the {what}", path)
             yield stream
     except FileNotFoundError:
         raise FileError(

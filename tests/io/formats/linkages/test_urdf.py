@@ -149,7 +149,7 @@ JOINT = '<joint name="a" type="revolute"><origin xyz="0 0 1"/><parent link="base
     ("text", "sentence"),
     [
         ("<robot><link name='a'>", ":1: not valid XML"),
-        ("<!DOCTYPE robot><robot/>", ":1: a URDF has no document type"),
+        ("<!DOCTYPE robot><robot/>", ":1: this URDF file has a document type"),
         (
             "<robot><link name='base'/><link name='arm'/>\n"
             + JOINT.replace("0 0 1", "0 1", 1)

@@ -172,7 +172,7 @@ def parse_xml(text: str, path: Path, what: str) -> Element:
             stack[-1].text += characters
 
     def refuse_doctype(*_: Any) -> None:
-        sentence = f"a {what.removesuffix(' file')} has no document type. Remove <!DOCTYPE ..>"
+        sentence = f"this {what} has a document type. Remove <!DOCTYPE ..>"
         raise FileError(sentence, path, parser.CurrentLineNumber)
 
     parser.StartElementHandler, parser.EndElementHandler = start, end
