@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The commands `loopcal board` and `loopcal photos`."""
 
+import re
 import shutil
 import sys
 from pathlib import Path
@@ -78,6 +79,16 @@ def test_photos_become_a_measurement_file_that_calibrates(
     loopcal("calibrate hexapod-42 points.csv -o run", code=(0, 2))
     fit = lc.load_run("run").result["fit"]
     assert fit["chi_square"] / fit["degrees"] < 1.0  # corners are better than the assumed 0.1 px
+    text, fitted = Path("points.csv").read_bytes(), lc.load_run("run").arrays["residual_0_image"]
+    loopcal(f"{words} --residuals run", "--force", code=1)
+    loopcal(f"{words} --residuals run --force")
+    page = Path("points.html").read_text("utf-8")
+    assert Path("points.csv").read_bytes() == text
+    (times,) = re.findall(r"predicted - seen, (\d+) times", page)
+    drawn = [[float(x), float(y)] for x, y in re.findall(r'<path d="M\S+ \S+?l(\S+) (\S+?)"', page)]
+    np.testing.assert_allclose(drawn, float(times) * fitted, rtol=0.01, atol=0.6)  # [px], rounded
+    loopcal("report run -o report.html")
+    assert 'id="arrow-figure' in Path("report.html").read_text("utf-8")
     loopcal(words, "--force", code=1)
     found = loopcal(f"{words} --force --json --workers 1").json
     assert [entry["pose"] for entry in found["pictures"]] == [f"p{i}" for i in range(9)]

@@ -126,6 +126,8 @@ def test_other_sizes_and_other_zooms_are_left_out(tmp_path) -> None:
     assert page.count("<img") == 5
     assert "<b><b>" not in page
     assert "http" not in page
+    with pytest.raises(DataError, match="no residuals of these pictures"):
+        format_contact_sheet(found, names, [])
 
 
 def test_poses_are_names_of_pictures_or_rows_of_a_table(tmp_path) -> None:

@@ -69,6 +69,7 @@ class KindResiduals:
 
     kind : its name. components : names of the m residuals. poses : (r,) labels.
     raw : (r, m) [SI]. whitened : (r, m), divided by sigma (zero where absent).
+    measured : (r, m) the values that the residuals are of [SI]; NaN where a residual is of none.
     context : name -> (r,), time [s] and temperatures [degC] of the rows, to plot the residuals
         against.
     dimensions : (m,) of the components. readings : (r, a) actuator readings of the rows [SI], of
@@ -80,6 +81,7 @@ class KindResiduals:
     poses: tuple[str, ...]
     raw: FloatArray
     whitened: FloatArray
+    measured: FloatArray
     context: Mapping[str, FloatArray] = field(default_factory=dict)
     dimensions: tuple[Dimension, ...] = ()
     readings: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
@@ -87,7 +89,10 @@ class KindResiduals:
     # first words of the names of stored arrays, beside those of the context; `rows` are labels
     FIELDS: ClassVar[tuple[Field, ...]] = (
         Field("residual", "raw", is_stored=True),
-        *(Field(n, is_stored=True) for n in ("whitened", "components", "dimensions", "readings")),
+        *(
+            Field(name, is_stored=True)
+            for name in ("whitened", "measured", "components", "dimensions", "readings")
+        ),
         Field("rows", "poses", is_stored=True),
     )
 
@@ -147,6 +152,15 @@ def label_residuals(
             ),
             raw=np.where(measured, r.raw[0], np.nan),
             whitened=r.whitened[0],
+            measured=np.stack(
+                [
+                    s.measured[0, :, s.kind.columns.index(column)]
+                    if column in s.kind.columns
+                    else np.full(len(s.poses), np.nan)
+                    for column in s.kind.noise_columns
+                ],
+                axis=-1,
+            ),
             context=columns,
             dimensions=tuple(column.dimension for column in s.kind.noise_columns),
             # of the first pose of each row; targets on the base have none

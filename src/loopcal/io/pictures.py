@@ -22,6 +22,7 @@ import numpy as np
 
 from loopcal.environment import import_optional
 from loopcal.errors import DataError, FileError
+from loopcal.estimate.result import KindResiduals
 from loopcal.findings import Finding, report_finding
 from loopcal.io.core.csv_table import format_row, read_table
 from loopcal.io.core.limits import make_name
@@ -31,7 +32,7 @@ from loopcal.io.data.kind_settings import describe_kind, describe_stated_values
 from loopcal.io.robot.robot_file import check_format
 from loopcal.measure.kinds.image import PRINT_SD, Image, state_camera
 from loopcal.typing import FloatArray, IntArray
-from loopcal.units import Length
+from loopcal.units import Dimension, Length
 
 FORMAT = 1
 # Markers of the dictionaries; the smallest that suffices has the most different markers.
@@ -285,6 +286,8 @@ LEAST_CORNERS = 8  # corners below which a picture is left out: two more than de
 BLUR = 3.0  # standard deviation of the blur of edges [px] from which a picture is left out
 REDUCED = (2, 4)  # times that a picture is reduced to see whether only blur hides the board
 THUMBNAIL = 480  # width of a picture on the contact sheet [px]
+ARROW = 0.03  # length of an arrow of the rms of the residuals, as a share of that width
+SAME_PIXEL = 1e-3  # difference up to which two corners are the same: files have three decimals [px]
 FULL_FRAME = 43.2666  # diagonal of the film that focal lengths of phones refer to [mm]
 # Difference of focal lengths, as a share, from which a picture is of another zoom.
 SAME_FOCAL = 0.01
@@ -311,7 +314,7 @@ class Picture:
     path : the file. size : width and height. focal : focal length by EXIF [px]; None without.
     corners : (n,) numbers. pixels : (n, 2), pixel (0, 0) being the middle of the first one.
     blur : standard deviation of the blur of edges [px], in the worse direction; NaN if unknown.
-    fault : why it is left out. thumbnail : JPEG with the corners.
+    fault : why it is left out. thumbnail : JPEG.
     """
 
     path: Path
@@ -369,9 +372,7 @@ def examine_picture(task: PictureTask) -> Picture:
         fault = report_finding("pictures.blurred", blur=round(blur, 1), limit=task.most_blur)
     scale = min(1.0, THUMBNAIL / gray.shape[1])
     shown = max(1, round(scale * gray.shape[1])), max(1, round(scale * gray.shape[0]))
-    small = cv2.cvtColor(cv2.resize(gray, shown, interpolation=cv2.INTER_AREA), cv2.COLOR_GRAY2BGR)
-    for u, v in scale * pixels:
-        cv2.circle(small, (round(u), round(v)), 4, (0, 90, 230), 1, cv2.LINE_AA)
+    small = cv2.resize(gray, shown, interpolation=cv2.INTER_AREA)
     thumbnail = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, 75])[1].tobytes()
     return Picture(task.path, size, focal, corners, pixels, blur, fault, thumbnail)
 
@@ -556,28 +557,80 @@ def format_pictures(
     return "\n".join(lines) + "\n"
 
 
-def format_contact_sheet(pictures: Sequence[Picture], names: Mapping[Path, str]) -> str:
-    """Return one HTML page of all pictures with their corners."""
+def find_residuals(
+    picture: Picture, pose: str, residuals: Sequence[KindResiduals]
+) -> FloatArray:
+    """Return the residuals (n, 2) [px] of the corners of a picture in a fit; NaN without one."""
+    found = np.full_like(picture.pixels, np.nan)
+    for rows in residuals:
+        own = np.flatnonzero(np.array(rows.poses) == pose)
+        if set(rows.dimensions) == {Dimension.PIXEL}:
+            apart = np.abs(picture.pixels[:, None] - rows.measured[own]).max(axis=2)
+            corner, row = np.nonzero(apart < SAME_PIXEL)
+            found[corner] = rows.raw[own[row]]
+    return found
+
+
+def format_contact_sheet(
+    pictures: Sequence[Picture],
+    names: Mapping[Path, str],
+    residuals: Sequence[KindResiduals] | None = None,
+) -> str:
+    """Return one HTML page of all pictures with their corners, and with arrows to the predicted
+    corners where a fit has residuals of them.
+
+    DataError : it has residuals of none.
+    """
+    moved = [find_residuals(p, names[p.path], residuals or ()) for p in pictures]
+    every = np.concatenate(moved)
+    every = every[np.isfinite(every)]
+    if residuals is not None and not len(every):
+        raise DataError(
+            "the calibration has no residuals of these pictures. Name the run folder of one that "
+            "used their corners"
+        )
+    rms = float(np.sqrt((every**2).mean())) if len(every) else 0.0
+    times = ARROW * pictures[0].size[0] / max(rms, 1e-9)
     cards = []
-    for picture in pictures:
+    for picture, arrows in zip(pictures, moved, strict=True):
         source = base64.b64encode(picture.thumbnail).decode()
         image = f'<img alt="" src="data:image/jpeg;base64,{source}">' if source else ""
         name = escape(f"{picture.path.name}: pose {names[picture.path]}")
+        size = np.sqrt(np.nanmean(arrows**2)) if np.isfinite(arrows).any() else None
+        words = describe_picture(picture) + ("" if size is None else f", residuals {size:.2g} px")
         cards.append(
-            f'<figure class="{"bad" if picture.fault else "good"}">{image}<figcaption><b>{name}</b>'
-            f"<br>{escape(describe_picture(picture))}</figcaption></figure>"
+            f'<figure class="{"bad" if picture.fault else "good"}"><div>{image}'
+            f"{_draw_corners(picture, times * arrows)}</div>"
+            f"<figcaption><b>{name}</b><br>{escape(words)}</figcaption></figure>"
         )
     used = sum(picture.fault is None for picture in pictures)
+    note = f"<p>Arrows: predicted - seen, {times:.0f} times. rms {rms:.2g} px</p>" if rms else ""
     return (
         '<!doctype html><html lang="en"><head><meta charset="utf-8"><title>Pictures</title>'
         "<style>body{font:15px sans-serif;margin:1rem;color:#222;background:#fff}"
         "main{display:grid;grid-template-columns:repeat(auto-fill,minmax(18rem,1fr));gap:1rem}"
         "figure{margin:0;border:2px solid #8a8;padding:.5rem}.bad{border-color:#b22}"
-        "img{width:100%}</style></head><body>"
-        f"<h1>Pictures of the board: {used} of {len(pictures)} are used</h1><main>"
-        + "\n".join(cards)
-        + "</main></body></html>\n"
+        "div{position:relative}img{width:100%}div svg{position:absolute;left:0;width:100%}"
+        "circle{fill:none;stroke:#e65a00}path{stroke:#0072b2;marker-end:url(#tip)}"
+        "</style></head><body>"
+        f"<h1>Pictures of the board: {used} of {len(pictures)} are used</h1>{note}"
+        '<svg width="0" height="0"><marker id="tip" orient="auto" refX="2" refY="2" '
+        'markerWidth="4" markerHeight="4"><polygon points="0,0 4,2 0,4" fill="#0072b2"/></marker>'
+        "</svg><main>" + "\n".join(cards) + "</main></body></html>\n"
     )
+
+
+def _draw_corners(picture: Picture, arrows: FloatArray) -> str:
+    """Return the corners of a picture and arrows (n, 2) from them as SVG."""
+    width, height = picture.size
+    shapes = [f'<circle cx="{u:.0f}" cy="{v:.0f}" r="1%"/>' for u, v in picture.pixels]
+    shapes += [
+        f'<path d="M{u:.0f} {v:.0f}l{du:.0f} {dv:.0f}"/>'
+        for (u, v), (du, dv) in zip(picture.pixels, arrows, strict=True)
+        if np.isfinite(du)
+    ]
+    lines = f'viewBox="0 0 {width} {height}" stroke-width="{width / THUMBNAIL:.1f}"'
+    return f"<svg {lines}>{''.join(shapes)}</svg>"
 
 
 def describe_picture(picture: Picture) -> str:

@@ -565,6 +565,10 @@ def photos(
     workers: int | None = opt.option(
         "Processes that compute.  [default: the number of processors]", type=opt.Count("WORKERS", 1)
     ),
+    residuals: Path | None = opt.path(
+        "Run folder of a calibration with these pictures. Its residuals become arrows on the page, "
+        "and the measurement file stays as it is."
+    ),
     output: Path = opt.path(
         "Measurement file to write. The page of all pictures gets its name with .html.",
         "-o",
@@ -580,11 +584,13 @@ def photos(
     Examples:
       loopcal photos pictures --board board.yaml -o points.csv
       loopcal photos pictures --board board.yaml --poses poses.csv -o points.csv
+      loopcal photos pictures --board board.yaml -o points.csv --residuals run --force
     """
     from contextlib import closing
 
     from loopcal.cli.commands.study_commands import count_processors
     from loopcal.environment import import_optional
+    from loopcal.estimate.result import residuals_from_arrays
     from loopcal.findings import report_finding
     from loopcal.io import pictures as of
     from loopcal.io.core.csv_table import refuse_settings_beside
@@ -595,7 +601,11 @@ def photos(
         raise DataError(f"{output} becomes a measurement file. Use a name that ends in .csv")
     page_file, known = output.with_suffix(".html"), of.read_board(board)
     paths = of.list_pictures(folder)
-    refuse_outputs((output, page_file), (board, poses, *paths), force)
+    fitted = None
+    if residuals is not None:
+        fitted = residuals_from_arrays(lc.load_run(residuals).arrays)
+    written = (output, page_file) if fitted is None else (page_file,)
+    refuse_outputs(written, (board, poses, *paths), force)
     refuse_settings_beside(output)
     of.load_dictionary(import_optional("cv2", "camera"), known)
     if known.measured is None:
@@ -615,8 +625,11 @@ def photos(
             found[path] = answer.result or of.Picture(path, fault=lost)
             progress(len(found), len(paths), "finding corners")
     pictures = of.compare_pictures([found[path] for path in paths])
-    text = of.format_pictures(known, pictures, names, mount, sigma, beside)
-    write_files({output: text, page_file: of.format_contact_sheet(pictures, names)})
+    texts = {
+        output: of.format_pictures(known, pictures, names, mount, sigma, beside),
+        page_file: of.format_contact_sheet(pictures, names, fitted),
+    }
+    write_files({file: texts[file] for file in written})
     used = [picture for picture in pictures if picture.fault is None]
     shown = [
         {"picture": p.path, "pose": names[p.path], "corners": len(p.corners)}

@@ -19,6 +19,7 @@ from loopcal.report.document.elements import CalibrationRecord, Element, Picture
 from loopcal.report.figures.fit_figures import (
     draw_correlation_matrix,
     draw_parameter_rows,
+    draw_residual_arrows,
     draw_residual_rows,
 )
 from loopcal.report.figures.result_figures import (
@@ -38,7 +39,7 @@ from loopcal.report.scene.scene import (
     format_scene,
 )
 from loopcal.report.words import say
-from loopcal.units import find_unit
+from loopcal.units import Dimension, find_unit
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -103,6 +104,16 @@ def draw_residual_picture(record: CalibrationRecord) -> Iterator[Element]:
     )
 
 
+@report_figure("residuals")
+def draw_arrow_picture(record: CalibrationRecord) -> Iterator[Element]:
+    """Yield the residuals of pictures, of many corners some, as arrows."""
+    seen = [rows for rows in record.residuals if set(rows.dimensions) == {Dimension.PIXEL}]
+    if seen and record.converged:
+        count = sum(len(rows.raw) for rows in seen)
+        drawn = draw_residual_arrows(record.robot.name, [thin_rows(rows, count) for rows in seen])
+        yield show_figure(drawn, "arrow-figure")
+
+
 def thin_rows(rows: KindResiduals, count: int) -> KindResiduals:
     """Return residuals with at most their share of MOST_ROWS rows, evenly spread; count : number of
     the rows of all kinds.
@@ -115,6 +126,7 @@ def thin_rows(rows: KindResiduals, count: int) -> KindResiduals:
         poses=tuple(rows.poses[i] for i in kept),
         raw=rows.raw[kept],
         whitened=rows.whitened[kept],
+        measured=rows.measured[kept],
         context={name: values[kept] for name, values in rows.context.items()},
         readings=rows.readings[kept],
     )

@@ -261,6 +261,29 @@ def _add_band(axes: Axes) -> None:
         axes.axhline(sign * BAND, **DASHED, zorder=1)
 
 
+# Length of an arrow of the rms of the residuals, as a share of the width of a picture.
+ARROW = 0.02
+
+
+def draw_residual_arrows(robot: str, residuals: Sequence[KindResiduals]) -> Figure:
+    """Draw residuals in pixels as arrows from where points were seen, for each kind in a panel.
+
+    residuals : of kinds whose two components are pixels.
+    """
+    figure, panels = start_panels(11.0, 6.0, 1, len(residuals))
+    for axes, rows in zip(panels[0], residuals, strict=True):
+        (u, v), (du, dv) = rows.measured.T, rows.raw.T
+        rms = max(float(np.sqrt(np.nanmean(rows.raw**2))), 1e-9)
+        times = ARROW * float(np.nanmax(rows.measured)) / rms
+        how: dict[str, Any] = {"angles": "xy", "scale_units": "xy", "scale": 1.0 / times}
+        axes.quiver(u, v, du, dv, color=COLORS[0], width=0.0015, rasterized=len(u) > MANY, **how)
+        axes.set_aspect("equal")
+        axes.invert_yaxis()
+        title = f"{name_count(len(set(rows.poses)), 'picture')}, rms {rms:.2g} px"
+        label_axes(axes, "u [px]", "v [px]", f"{title}, arrows {times:.0f} times")
+    return finish_figure(figure, f"{robot}: predicted - seen")
+
+
 # Parameters of a fit: shifts with their intervals, uncertainties, and correlations.
 
 MOST_ROWS, MOST_NAMES = 50, 110
