@@ -55,7 +55,11 @@ def render(
     every = cv2.resize(place.astype(np.float32), None, fx=times, fy=times)
     every = every[times : times + fine * size[1], times : times + fine * size[0]]
     values = cv2.remap(
-        texture, every, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=110
+        texture,
+        *cv2.split(every),
+        cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_CONSTANT,
+        borderValue=110,
     )
     if blur > 0.0:
         values = cv2.GaussianBlur(values, (0, 0), blur * fine)

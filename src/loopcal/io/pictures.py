@@ -30,7 +30,14 @@ from loopcal.io.core.records import read_record
 from loopcal.io.core.yaml_file import format_flow, format_yaml, read_yaml
 from loopcal.io.data.kind_settings import describe_kind, describe_stated_values
 from loopcal.io.robot.robot_file import check_format
-from loopcal.measure.kinds.image import PRINT_SD, Image, state_camera
+from loopcal.measure.kinds.image import (
+    NARROW,
+    PRINT_SD,
+    Image,
+    shows_board,
+    solve_homography,
+    state_camera,
+)
 from loopcal.typing import FloatArray, IntArray
 from loopcal.units import Dimension, Length
 
@@ -285,6 +292,8 @@ ENDINGS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".heic", "
 LEAST_CORNERS = 8  # corners below which a picture is left out: two more than determine a pose well
 BLUR = 3.0  # standard deviation of the blur of edges [px] from which a picture is left out
 REDUCED = (2, 4)  # times that a picture is reduced to see whether only blur hides the board
+# Half of the window around a corner, as a share of the white margins of two markers beside it.
+WINDOW = 0.48
 THUMBNAIL = 480  # width of a picture on the contact sheet [px]
 ARROW = 0.03  # length of an arrow of the rms of the residuals, as a share of that width
 SAME_PIXEL = 1e-3  # difference up to which two corners are the same: files have three decimals [px]
@@ -364,10 +373,11 @@ def examine_picture(task: PictureTask) -> Picture:
         flipped = np.ascontiguousarray(gray[:, ::-1])
         if len(find_corners(cv2, flipped, task.board)[0]) >= least:
             fault = report_finding("pictures.mirrored")
-        elif any(len(find_corners(cv2, r, task.board)[0]) > len(corners) for r in reduced):
+        elif any(len(find_corners(cv2, r, task.board)[0]) >= least for r in reduced):
             fault = report_finding("pictures.blurred", blur=None, limit=task.most_blur)
         else:
-            fault = report_finding("pictures.few-corners", found=len(corners), least=least)
+            data = {"found": len(corners), "least": least, "narrow": NARROW}
+            fault = report_finding("pictures.few-corners", **data)
     elif blur > task.most_blur:
         fault = report_finding("pictures.blurred", blur=round(blur, 1), limit=task.most_blur)
     scale = min(1.0, THUMBNAIL / gray.shape[1])
@@ -399,24 +409,37 @@ def _load_picture(path: Path) -> tuple[np.ndarray[Any, np.dtype[np.uint8]], floa
 
 
 def find_corners(cv2: Any, gray: Any, board: Board) -> tuple[IntArray, FloatArray]:
-    """Return numbers (n,) and pixels (n, 2) of the inner corners of a board."""
+    """Return numbers (n,) and pixels (n, 2) of the inner corners of a board whose squares look wide
+    enough; none where these do not determine the pose of the board.
+    """
     dictionary = load_dictionary(cv2, board)
     layout = cv2.aruco.CharucoBoard(board.squares, board.square, board.marker, dictionary)
     pixels, corners, _, _ = cv2.aruco.CharucoDetector(layout).detectBoard(gray)
+    none = np.zeros(0, dtype=np.intp), np.zeros((0, 2))
     if corners is None or len(corners) == 0:
-        return np.zeros(0, dtype=np.intp), np.zeros((0, 2))
+        return none
     corners, pixels = corners.ravel().astype(np.intp), pixels.reshape(-1, 2).astype(float)
-    # once more in a window without the markers; blurred, because steps between pixels mislead
     pairs = _pair_neighbors(board, corners)
-    gaps = np.concatenate([np.linalg.norm(pixels[b] - pixels[a], axis=1) for a, b in pairs])
-    if len(gaps):
-        window = int(np.clip(0.1 * gaps.min(), 2, 20))
-        criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-3)
-        smooth = cv2.GaussianBlur(gray.astype(np.float32), (0, 0), 1.0)
-        start = pixels.astype(np.float32).reshape(-1, 1, 2)
-        found = cv2.cornerSubPix(smooth, start, (window, window), (-1, -1), criteria)
-        pixels = found.reshape(-1, 2).astype(float)
-    return corners, pixels
+    side = max(np.linalg.norm(pixels[b] - pixels[a], axis=1).max(initial=0.0) for a, b in pairs)
+    place = side * (np.stack(np.divmod(corners, board.corners[0])[::-1], axis=1) + 1.0)
+    if not side or not shows_board(place, pixels[None])[0]:
+        return none
+    # once more as seen from the front, where the edges of all squares are at right angles, in a
+    # window without the markers; blurred, because steps between pixels mislead
+    H = solve_homography(place, pixels)
+    size = [round(side * n) for n in board.squares]
+    how = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    front = cv2.warpPerspective(gray.astype(np.float32), H, size, flags=how)
+    smooth = cv2.GaussianBlur(front, (0, 0), 1.0)
+    half = int(np.clip(WINDOW * (1.0 - board.marker / board.square) * side, 2, 20))
+    criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-3)
+    start = cv2.perspectiveTransform(pixels[:, None], np.linalg.inv(H)).astype(np.float32)
+    found = cv2.cornerSubPix(smooth, start, (half, half), (-1, -1), criteria)
+    pixels = cv2.perspectiveTransform(found.astype(float), H)[:, 0]
+    slope = H[:2, :2] - pixels[:, :, None] * H[2, :2]  # of pixels by places
+    slope = slope / (found[:, 0] @ H[2, :2] + H[2, 2])[:, None, None]
+    is_wide = side * np.linalg.svd(slope, compute_uv=False)[:, 1] > NARROW
+    return corners[is_wide], pixels[is_wide]
 
 
 def _pair_neighbors(board: Board, corners: IntArray) -> list[tuple[IntArray, IntArray]]:
@@ -557,9 +580,7 @@ def format_pictures(
     return "\n".join(lines) + "\n"
 
 
-def find_residuals(
-    picture: Picture, pose: str, residuals: Sequence[KindResiduals]
-) -> FloatArray:
+def find_residuals(picture: Picture, pose: str, residuals: Sequence[KindResiduals]) -> FloatArray:
     """Return the residuals (n, 2) [px] of the corners of a picture in a fit; NaN without one."""
     found = np.full_like(picture.pixels, np.nan)
     for rows in residuals:

@@ -19,7 +19,7 @@ from loopcal import geometry
 from loopcal.errors import DataError, EstimationError
 from loopcal.findings import Finding, report_finding
 from loopcal.measure.instrument import Gaussian, Instrument, Sensor
-from loopcal.measure.kinds.image import PRINT_SD, Image, state_camera
+from loopcal.measure.kinds.image import NARROW, PRINT_SD, Image, state_camera
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.solutions import Solution
 from loopcal.planning.candidates import draw_candidates
@@ -33,8 +33,7 @@ AROUND = np.radians(np.arange(0.0, 360.0, 45.0))  # directions about the normal
 FILLED = 0.92  # share of a picture that the places of the board fill
 DRAWN = 60  # poses by which stations are compared
 CLEAR = 30.0  # width of a square in a picture [px], where it is narrow, whose marker is found
-LEAST, CORNERS, USABLE = 15.0, 8, 0.5
-"""Width of a square [px] and corners that a picture needs, and share of poses with such ones."""
+CORNERS, USABLE = 8, 0.5  # corners that a picture needs, and share of poses with such pictures
 ALIKE = 0.02  # share by which a station may be worse than the best, if it comes before it
 SIGMA = 0.1  # standard deviation of a corner in a picture [px]
 
@@ -152,7 +151,7 @@ def _watch(camera: Image, poses: Solution) -> View:
     columns = camera.measure(each, np.zeros((1, each.shape[1], 2)))
     seen = camera.hide_unseen(each, columns, camera.nominal_values[None, None])
     corners = camera.detect_present(seen).reshape(len(T), -1, 2).all(axis=2).sum(axis=1)
-    is_usable = (corners >= min(CORNERS, camera.rows_per_pose)) & (pixels >= LEAST)
+    is_usable = (corners >= min(CORNERS, camera.rows_per_pose)) & (pixels >= NARROW)
     tilt = np.degrees(np.arccos(cosine))
     return View(camera, distance, tilt, pixels, corners / camera.rows_per_pose, is_usable)
 
