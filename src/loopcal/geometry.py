@@ -582,7 +582,7 @@ FLATNESS = 1e-6  # ratio of extents [1] below which points count as coplanar, or
 # Change of a rotation [rad] that ends `solve_directions` and `minimize_over_rotations`; a descent
 # refines the result anyway.
 ROTATION_CHANGE = 1e-6
-MEETING = 0.02  # angle [rad] between two starts from which one of them stands for both
+MEETING = 0.03  # angle [rad] between two starts from which one of them stands for both
 
 NEWTON_STEPS, FLATTEST, ROUNDING = 40, 1e-9, 1e-15
 """Steps of Newton's method on rotations, of which a dozen are usual; the curvature, as a share of
@@ -655,7 +655,7 @@ def minimize_over_rotations(H: FloatArray, g: FloatArray, count: int = 3) -> lis
         goes_on &= np.argmax(meets & goes_on[:, None], axis=2) == order
         active = active[(longest > ROTATION_CHANGE) & goes_on.ravel()[active]]
     ends = zip(np.split(R, len(H)), np.split(value, len(H)), goes_on, strict=True)
-    return [_select_distinct(r[on][np.argsort(v[on])], count) for r, v, on in ends]
+    return [r[on][np.argsort(v[on])[:count]] for r, v, on in ends]
 
 
 def _evaluate_form(H: FloatArray, g: FloatArray, R: FloatArray) -> FloatArray:
@@ -670,24 +670,15 @@ def _find_newton_step(H: FloatArray, g: FloatArray, R: FloatArray) -> FloatArray
     """
     slope = (R.reshape(-1, 1, 9) @ H)[:, 0] - g
     first = (GENERATORS @ R[:, None]).reshape(-1, 3, 9)
-    second = (GENERATORS[:, None] @ GENERATORS @ R[:, None, None]).reshape(-1, 3, 3, 9)
-    bend = (second @ slope[:, None, :, None])[..., 0]
-    curvature = first @ H @ np.swapaxes(first, 1, 2) + 0.5 * (bend + np.swapaxes(bend, 1, 2))
-    size, axes = np.linalg.eigh(curvature)
-    along = (np.swapaxes(axes, 1, 2) @ first @ slope[..., None])[..., 0]
+    # generators i and j of the second derivatives have the product e_j e_i' - e_i'e_j
+    bend = slope.reshape(-1, 3, 3) @ np.swapaxes(R, 1, 2)
+    bend = (
+        0.5 * (bend + np.swapaxes(bend, 1, 2))
+        - np.eye(3) * np.einsum("kii->k", bend)[:, None, None]
+    )
+    size, axes = np.linalg.eigh(first @ H @ np.swapaxes(first, 1, 2) + bend)
+    along = (np.swapaxes(axes, 1, 2) @ (first @ slope[..., None]))[..., 0]
     return -(axes @ (along / np.maximum(np.abs(size), FLATTEST))[..., None])[..., 0]
-
-
-def _select_distinct(R: FloatArray, count: int) -> FloatArray:
-    """Return the first `count` of rotations (k, 3, 3) with entries more than 0.02 from all of these
-    before.
-    """
-    near = (np.abs(R[:, None] - R).max(axis=(2, 3)) <= 0.02).tolist()
-    kept: list[int] = []
-    for i, is_near in enumerate(near):
-        if len(kept) < count and not any(is_near[j] for j in kept):
-            kept.append(i)
-    return R[kept]
 
 
 def solve_hand_eye(

@@ -96,7 +96,10 @@ class FitAnalysis:
 
     def identification(self) -> Identification:
         """Return the result, whose fields are computed when they are asked for."""
-        return self._identification(**{name: self._later(name) for name in COMPLETED})
+        covariance = later(lambda: self.completed.covariance)
+        nuisance = later(lambda: self.completed.nuisance)
+        others = {name: self._later(name) for name in ("posterior", "findings")}
+        return self._identification(covariance=covariance, nuisance=nuisance, **others)
 
     def _identification(self, **own: Any) -> Identification:
         others = ("history", "residual_test", "spectrum", "regularization", "unidentifiable")
@@ -279,16 +282,6 @@ class FitAnalysis:
             return result
         blocks = linked_blocks(self.data)
         return add_loss_uncertainty(result, self.fit, self.problem, self.weighted, blocks)
-
-    @property
-    def covariance(self) -> FloatArray:
-        """(p, p) covariance [SI]."""
-        return self.completed.covariance
-
-    @property
-    def nuisance(self) -> NuisanceEstimate:
-        """Frames, targets, surfaces and offsets of the measurements."""
-        return self.completed.nuisance
 
     @cached_property
     def fitted_rows(self) -> FittedRows | None:

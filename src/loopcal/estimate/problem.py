@@ -10,8 +10,7 @@ platform's twist, and the error model D = d twist / d parameter, the row is
 [W G D diag(tolerance) | W r]. Unknowns of all scopes are eliminated from the innermost outwards:
 the coordinates of poses whose readings are uncertain (block by block, while rows are made), then
 groups, sessions and what all rows share. What is left is folded into one triangular factor, so that
-the memory of a fit is its parameters squared plus one block. See docs/theory/identification.md and
-docs/theory/identification.md.
+the memory of a fit is its parameters squared plus one block. See docs/theory/identification.md.
 
 The rank of a Jacobian with residuals contains second-order terms. Turn a robot with its surfaces
 about a line: what is left between the points and the line turns as well, so that a first-order row
@@ -274,7 +273,8 @@ class Problem:
 
         A weight of 0 makes the rows of a pose absent.
         """
-        return self.with_rows(r.weighted(weight) for r in self.rows)
+        is_one = bool((weight == 1.0).all())
+        return self if is_one else self.with_rows(r.weighted(weight) for r in self.rows)
 
     def at_measured_poses(self, T: FloatArray) -> Problem:
         """Return the problem whose closure is linearized at poses (T | 1, n, 4, 4) [m] that were

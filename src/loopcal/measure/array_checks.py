@@ -138,6 +138,6 @@ def describe(value: object) -> str:
 
 
 def set_fields(instance: object, **values: object) -> None:
-    """Set fields of a frozen dataclass to their checked values; for its `__post_init__` alone."""
+    """Set fields of a frozen dataclass to their checked values, or those of a copy."""
     for name, value in values.items():
         object.__setattr__(instance, name, value)

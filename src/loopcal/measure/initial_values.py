@@ -248,16 +248,16 @@ def _list_groups(
         order = np.argsort(member.ravel(), kind="stable")
         ends = np.cumsum(np.bincount(member.ravel(), minlength=len(sets)))[:-1]
         parts = np.split(counts[order], ends) if len(sets) else []
+        # an even choice of enough rows will do, unless it lacks most values of a component
         unknowns = len(rows.kind.nuisance_parameters)
+        most = max(FEWEST_ROWS, int(VALUES * unknowns / rows.present.shape[1]))
         for own, indices in zip(parts, sets, strict=True):
-            # start values need an even choice of enough rows, unless it lacks most values of a
-            # component
-            present = rows.present[own]
-            most = max(FEWEST_ROWS, int(VALUES * unknowns / present.shape[1]))
-            chosen = choose_evenly(len(own), most)
-            left, whole = present[chosen].sum(axis=0), present.sum(axis=0)
-            is_enough = (left >= np.minimum(whole, most // 2)).all()
-            listed.append((i, own[chosen] if is_enough else own, indices))
+            listed.append((i, own, indices))
+            if len(own) > most:
+                chosen = own[choose_evenly(len(own), most)]
+                left, whole = (rows.present[some].sum(axis=0) for some in (chosen, own))
+                if (left >= np.minimum(whole, most // 2)).all():
+                    listed[-1] = (i, chosen, indices)
     listed.sort(key=lambda g: (kinds[g[0]][0], kinds.index(kinds[g[0]]), -len(g[1])))
     # a group comes in a later turn than those before it with which it shares an unknown parameter
     turn, turns = np.zeros(len(known), dtype=np.int64), defaultdict(list)

@@ -295,7 +295,7 @@ class Measurements(TableResult):
         for rows in self.observations:
             target = place[rows.rows]
             kept = np.all(target.reshape(len(rows), rows.kind.poses_per_row) >= 0, axis=1)
-            observations.append(replace(rows.take(kept), rows=target[kept]))
+            observations.append(rows.take(kept, target[kept]))
         of_poses: dict[str, Any] = {
             name: None if values is None else values[chosen]
             for name in OF_POSES

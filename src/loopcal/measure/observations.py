@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from copy import copy
 from dataclasses import asdict, dataclass, field, replace
 from datetime import date
 from types import MappingProxyType
@@ -412,19 +413,28 @@ class Observations:
         """
         return self.kind.evaluate(T[:, self.rows], self.measured[None], nuisance, joints)
 
-    def take(self, keep: ArrayLike) -> Self:
-        """Return the rows at these indices, or of this mask."""
+    def take(self, keep: ArrayLike, poses: IntArray | None = None) -> Self:
+        """Return the rows at these indices, or of this mask; `poses` are the indices of the poses
+        of these, by default the present ones. They are not checked again.
+        """
         chosen = np.asarray(keep)
-        names = ("rows", "measured", "covariance", "weight", "session", "group")
+        names = ("rows", "measured", "covariance", "weight", "session", "group", "present")
+        names = (*names, "whitener")
         arrays: dict[str, Any] = {name: take_rows(getattr(self, name), chosen) for name in names}
-        context = {name: values[chosen] for name, values in self.context.items()}
+        if poses is not None:
+            arrays["rows"] = poses
         if self.kind.is_drift.any():
             arrays["progress"] = self.drift_part[chosen]
+        for array in arrays.values():
+            array.setflags(write=False)
         parts = tuple(
             part._replace(covariance=take_rows(part.covariance, chosen))
             for part in self.noise_parts
         )
-        return replace(self, context=context, noise_parts=parts, **arrays)
+        context = {name: values[chosen] for name, values in self.context.items()}
+        taken = copy(self)
+        set_fields(taken, context=context, noise_parts=parts, **arrays)
+        return taken
 
     def split_noise(self) -> list[tuple[str, StatedSize | None, FloatArray | None]]:
         """Return name, stated size and root (r, m, m) of each part of the noise. Whitened rows

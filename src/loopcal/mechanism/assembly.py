@@ -145,11 +145,11 @@ class SharedMap:
     outputs: tuple[Address, ...]
 
     def value(self, inputs: FloatArray) -> FloatArray:
-        """Map (t, i) to (t, o); its change from the nominal value is the displacement."""
+        """Map (.., i) to (.., o); its change from the nominal value is the displacement."""
         raise NotImplementedError
 
     def jacobian(self, inputs: FloatArray) -> FloatArray:
-        """Return the derivative (t, o, i) at inputs (t, i)."""
+        """Return the derivative (.., o, i) at inputs (.., i)."""
         raise NotImplementedError
 
 

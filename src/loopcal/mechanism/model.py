@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections import defaultdict
+from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any, ClassVar, NamedTuple
@@ -136,10 +137,8 @@ class SlotMap:
         # element by element, so that a trial's result does not depend on its neighbors
         for places, columns, coefficients in self._layers:
             slots[:, places] += change[:, columns] * coefficients
-        for (shared, inputs, outputs), nominal in zip(
-            self._together, self._shared_nominal, strict=True
-        ):
-            slots[:, outputs] += _spread(shared.value, values, inputs) - nominal
+        for shared, inputs, outputs, nominal in self._together:
+            slots[:, outputs] += shared.value(values[:, inputs]) - nominal
         e, tau = slots[:, : self.n_displacements], slots[:, self.n_displacements :]
         return e, self.terms + tau.reshape(-1, *self.terms.shape)
 
@@ -155,26 +154,20 @@ class SlotMap:
         ]
 
     @cached_property
-    def _together(self) -> list[tuple[SharedMap, IntArray, IntArray]]:
+    def _together(self) -> list[tuple[SharedMap, IntArray, IntArray, FloatArray]]:
         """Shared maps, those that differ in names alone as one, with the positions (m, i) of the
-        inputs and (m, o) of the outputs of its m maps, each output once.
+        inputs and (m, o) of the outputs of its m maps, each output once, and nominal values.
         """
-        groups: dict[Any, tuple[SharedMap, list[tuple[int, ...]], list[tuple[int, ...]]]] = {}
         listed = [place for *_, outputs in self.shared for place in outputs]
-        is_apart = len(set(listed)) == len(listed)
-        for shared, inputs, outputs in self.shared:
-            is_plain = is_apart and len(vars(shared)) == len(fields(SharedMap))
-            key = type(shared) if is_plain else id(shared)
-            _, of_inputs, of_outputs = groups.setdefault(key, (shared, [], []))
-            of_inputs.append(inputs)
-            of_outputs.append(outputs)
-        return [(shared, np.array(i), np.array(o)) for shared, i, o in groups.values()]
-
-    @cached_property
-    def _shared_nominal(self) -> list[FloatArray]:
-        """Values (1, m, outputs) of the shared maps at the nominal parameters."""
-        at = self.nominal[None]
-        return [_spread(shared.value, at, inputs) for shared, inputs, _ in self._together]
+        is_apart, groups = len(set(listed)) == len(listed), defaultdict(list)
+        for each in self.shared:
+            is_plain = is_apart and len(vars(each[0])) == len(fields(SharedMap))
+            groups[type(each[0]) if is_plain else id(each[0])].append(each)
+        together = []
+        for group in groups.values():
+            of, inputs, outputs = group[0][0], *(np.array([g[i] for g in group]) for i in (1, 2))
+            together.append((of, inputs, outputs, of.value(self.nominal[None, inputs])))
+        return together
 
     @cached_property
     def touches(self) -> BoolArray:
@@ -222,17 +215,9 @@ class SlotMap:
     def jacobian(self, values: FloatArray) -> FloatArray:
         """Return d slots / d values, (t, s, p)."""
         J = np.repeat(self.matrix[None], len(values), axis=0)
-        for shared, inputs, outputs in self._together:
-            J[:, outputs[:, :, None], inputs[:, None]] += _spread(shared.jacobian, values, inputs)
+        for shared, inputs, outputs, _ in self._together:
+            J[:, outputs[:, :, None], inputs[:, None]] += shared.jacobian(values[:, inputs])
         return J
-
-
-def _spread(
-    function: Callable[[FloatArray], FloatArray], values: FloatArray, inputs: IntArray
-) -> FloatArray:
-    """Return a function (t m, i) -> (t m, ..) of inputs at places (m, i) of values, (t, m, ..)."""
-    result = function(values[:, inputs].reshape(-1, inputs.shape[1]))
-    return result.reshape(len(values), len(inputs), *result.shape[1:])
 
 
 @dataclass(frozen=True, eq=False)

@@ -54,14 +54,14 @@ class TowerMap(SharedMap):
     """
 
     def value(self, inputs: FloatArray) -> FloatArray:
-        """Map (t, 4) [m, rad, m, m] to (t, 3) [m]."""
-        radius, angle, arm, stop = inputs.T
+        """Map (.., 4) [m, rad, m, m] to (.., 3) [m]."""
+        radius, angle, arm, stop = (inputs[..., i] for i in range(4))
         x, y, height = radius * np.cos(angle), radius * np.sin(angle), _compute_rise(arm, radius)
-        return stack_matrix(((x, y, stop + height),))[:, 0]
+        return stack_matrix(((x, y, stop + height),))[..., 0, :]
 
     def jacobian(self, inputs: FloatArray) -> FloatArray:
-        """Return the derivative (t, 3, 4) at (t, 4)."""
-        radius, angle, arm, _ = inputs.T
+        """Return the derivative (.., 3, 4) at (.., 4)."""
+        radius, angle, arm, _ = (inputs[..., i] for i in range(4))
         c, s, height = np.cos(angle), np.sin(angle), _compute_rise(arm, radius)
         return stack_matrix(
             (
