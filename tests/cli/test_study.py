@@ -217,8 +217,8 @@ def test_study_on_a_full_disk_is_continued_when_there_is_space(tmp_path) -> None
         ("run small.yaml -o f --ray --workers 2", "--workers has no effect with --ray"),
         ("run small.yaml -o f --dask tcp://h:1 --ray", "--ray has no effect with --dask"),
         ("run missing.yaml -o f", "this study file does not exist"),
-        ("status small.yaml", "this folder contains no study"),
-        ("summary nowhere", "this folder contains no study"),
+        ("status small.yaml", "this is not the folder of a study"),
+        ("summary nowhere", "this is not the folder of a study"),
         ("sumary f", "did you mean 'summary'"),
     ],
 )

@@ -58,6 +58,8 @@ def test_pipes_and_devices_are_refused_at_once(tmp_path) -> None:
             for read in (lambda p: read_bytes(p, "robot file"), sha256, load_robot, read_table):
                 with pytest.raises(FileError, match=r"device or a pipe|cannot read"):
                     read(path)
+    with pytest.raises(FileError, match=r"does not exist|cannot read"):
+        read_bytes("/proc/kmsg", "robot file")  # a file, but reading it waits
 
 
 def test_settings_beside_a_table_may_be_no_pipe(tmp_path) -> None:

@@ -393,8 +393,10 @@ def read_bytes(path: str | Path, what: str, limit: FileLimit = PROGRAM_SIZE) -> 
         size = os.fstat(stream.fileno()).st_size
         limit.check(size, what, path)
         raw = stream.read(size + 1)
+        if raw is None:  # reading would wait, as in /proc/kmsg
+            raise BlockingIOError(errno.EAGAIN, os.strerror(errno.EAGAIN))
         if len(raw) > size:  # the file grew, or the system does not state its size
-            raw += stream.read(limit.count + 1 - size)
+            raw += stream.read(limit.count + 1 - size) or b""
     if len(raw) > limit.count:
         raise limit.make_error(what, path)
     return raw
@@ -411,8 +413,8 @@ def open_bytes(path: str | Path, what: str) -> Iterator[BufferedReader]:
         # the name, which may denote another file a moment later
         with os.fdopen(os.open(path, OPEN_FLAGS), "rb") as stream:
             if not stat.S_ISREG(os.fstat(stream.fileno()).st_mode):
-                sentence = "this is a device or a pipe. Name an ordinary file"
-                raise FileError(f"{sentence} with the {what}", path)
+                sentence = f"this is a device or a pipe. Save the {what} as an ordinary file"
+                raise FileError(f"{sentence} and name that", path)
             yield stream
     except FileNotFoundError:
         raise FileError(
