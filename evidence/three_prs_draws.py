@@ -30,7 +30,7 @@ def to_document(draws: Draws, seed: int) -> dict[str, Any]:
                 machines = int((sweep.compute_rises(algorithm, i) > gain).sum())
                 measures[name] = {"median": median, "machines": machines}
     return {
-        "robot": draws[0].study.name,
+        "robot": draws[0].study.design.name,
         "seed": seed,
         "draws": len(draws[0]),
         "minimum_inside": inside,

@@ -508,7 +508,7 @@ def make_true(claim: str, draws: list[tuple[steps.Sweep, ...]], is_true: np.ndar
                 pass
 
 
-CLAIMS = [name for name in results_module.TEXT._find("claims") if name != "noise"]
+CLAIMS = [name for name in results_module.TEXT.find("claims") if name != "noise"]
 
 
 @pytest.mark.slow

@@ -303,15 +303,18 @@ class PaperText:
 
     module: str
 
-    def _find(self, *keys: str) -> Any:
+    def find(self, *keys: str) -> Any:
+        """Return the text or mapping at these keys."""
         return PaperFile(self.module, "text.yaml").find(*keys)
 
     def about(self, robot: str = "") -> tuple[str, ...]:
         """Return the paragraphs at the beginning of the page; robot : name of another one."""
         source = PaperFile(self.module, "published.yaml").find("source")
-        return tuple(
-            fill_template(text, source=source, robot=robot) for text in self._find("about")
-        )
+        return tuple(fill_template(text, source=source, robot=robot) for text in self.find("about"))
+
+    def list_replaced(self, names: Iterable[str], **data: Any) -> tuple[str, ...]:
+        """Return the sentences of these names on sizes that another robot or rule replaces."""
+        return tuple(fill_template(self.find("replaced", name), **data) for name in names)
 
     def judge(
         self, name: str, agrees: Decision | Sequence[Decision] | BoolArray, /,
@@ -323,7 +326,7 @@ class PaperText:
         whether the machines have other dimensions than those of the paper. They do not refute a
         claim that is marked with `of: these machines`.
         """
-        record, draws = self._find("claims", name), ()
+        record, draws = self.find("claims", name), ()
         if isinstance(agrees, (Sequence, np.ndarray)):
             draws = tuple(None if a is None else bool(a) for a in agrees)
             agrees = decide_share(draws)
@@ -341,7 +344,7 @@ class PaperText:
         """Return a table of computed rows; more : titles and formats of further columns. shown :
         places of the rows on a page, by default the first ones, as many as text.yaml says.
         """
-        text = self._find("tables", name)
+        text = self.find("tables", name)
         titles = (text["title"], text.get("note", ""), *text["columns"], *(t for t, _ in more))
         title, note, *columns = (fill_template(part, **data) for part in titles)
         formats = (*text["formats"], *(spec for _, spec in more))
@@ -364,7 +367,7 @@ class PaperText:
         """Return a published table beside computed numbers (r, c), which agree within `step` (r,
         c), by default one unit of the last printed digit.
         """
-        text = self._find("tables", name)
+        text = self.find("tables", name)
         step = published.unit if step is None else step
         note, columns = fill_template(text.get("note", ""), **data), tuple(text["columns"])
         return Comparison(name, text["title"], columns, published, computed, step, note)
@@ -374,7 +377,7 @@ class PaperText:
         file_name: str = "", log: str | None = None, /, *, joined: bool = True, **data: Any,
     ) -> Figure:  # fmt: skip
         """Return a figure; log : default that of text.yaml."""
-        text = self._find("figures", name)
+        text = self.find("figures", name)
         title, x, y, caption = (
             fill_template(text[key], **data) for key in ("title", "x", "y", "caption")
         )

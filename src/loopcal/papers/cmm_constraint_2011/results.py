@@ -581,11 +581,10 @@ def list_replaced(results: Results) -> tuple[str, ...]:
     """Return sentences on further sizes that another robot replaces."""
     if results.case.robot is None:
         return ()
-    study, sentences = results.study, published.PaperFile(__file__, "text.yaml").find("replaced")
-    of = {"errors": study.describe_errors(find_figure_5()[0]), "robot": study.robot.name,
-          "unit": study.unit[1]}  # fmt: skip
+    study = results.study
+    errors, name = study.describe_errors(find_figure_5()[0]), study.robot.name
     kept = ["errors", *(["fixed"] if len(study.parts) == 1 else [])]
-    return tuple(published.fill_template(sentences[name], **of) for name in kept)
+    return TEXT.list_replaced(kept, errors=errors, robot=name, unit=study.unit[1])
 
 
 def compare_tables(results: Results) -> tuple[published.Comparison, ...]:

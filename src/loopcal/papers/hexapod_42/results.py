@@ -19,7 +19,6 @@ import numpy as np
 import loopcal as lc
 from loopcal import geometry
 from loopcal.errors import DataError, EstimationError
-from loopcal.findings.wording import fill_template
 from loopcal.measure.instrument import make_random_stream
 from loopcal.measure.kinds.poses import Pose
 from loopcal.measure.measurements import Measurements
@@ -234,14 +233,14 @@ def find_places(robot: Mechanism) -> IntArray:
 
 
 def to_coordinates(T: FloatArray) -> FloatArray:
-    """Return coordinates (n, 6) [m, rad] of transforms (n, 4, 4)."""
-    return np.concatenate([T[:, :3, 3], ANGLES.from_matrix(T[:, :3, :3])], axis=1)
+    """Return coordinates (.., 6) [m, rad] of transforms (.., 4, 4)."""
+    return np.concatenate([T[..., :3, 3], ANGLES.from_matrix(T[..., :3, :3])], axis=-1)
 
 
 def subtract_poses(first: FloatArray, second: FloatArray) -> FloatArray:
-    """Return differences (n, 6) of coordinates, angles wrapped."""
+    """Return differences (.., 6) of coordinates, angles wrapped."""
     change = first - second
-    return np.concatenate([change[:, :3], geometry.wrap_angle(change[:, 3:])], axis=1)
+    return np.concatenate([change[..., :3], geometry.wrap_angle(change[..., 3:])], axis=-1)
 
 
 def to_measurements(
@@ -339,12 +338,7 @@ def sweep_noise(setup: Setup, seed: int, trials: int) -> dict[str, Level]:
         values = np.where(is_known, cell.values, setup.robot.values)
         T = forward_trials(setup.robot, values, commanded.q[None], commanded.state).T
         measured = np.roll(cell.measured[0], 3, axis=2)  # a kind has its angles first
-        residual = np.stack(
-            [
-                subtract_poses(poses, to_coordinates(reached @ setup.robot.tool))
-                for poses, reached in zip(measured, T, strict=True)
-            ]
-        )
+        residual = subtract_poses(measured, to_coordinates(T @ setup.robot.tool))
         by_dimension = residual[..., :3] / MM, residual[..., 3:]
         rms = [np.sqrt(np.mean(x**2, axis=(1, 2))) for x in by_dimension]
         sizes = np.column_stack([*rms, setup.compute_error(values), integrate_errors(residual)])
@@ -388,15 +382,17 @@ def compare_methods(setup: Setup, seed: int, trials: int) -> dict[str, Draws]:
     errors = np.abs(setup.robot.values - truth) / units
     drawn = {name: inverse(setup.robot, draw_poses(setup, name, count, seed))
              for name in list_places(setup)}  # fmt: skip
+
+    def locate(machines: FloatArray, poses: Solution) -> FloatArray:
+        """Return positions (t, n, 3) of machines (t, p) at the readings of poses."""
+        T = forward_trials(setup.robot, machines, poses.q[None], poses.state).T
+        return (T @ setup.robot.tool)[..., :3, 3]
+
+    true = {name: locate(truth[None], poses) for name, poses in drawn.items()}
     for key, v in values.items():
         places = {}
         for name, poses in drawn.items():
-            found, true = (
-                forward_trials(setup.robot, machine, poses.q[None], poses.state).T
-                @ setup.robot.tool
-                for machine in (v, truth[None])
-            )
-            squares = np.sum(((found - true)[..., :3, 3] / MM) ** 2, axis=-1)
+            squares = np.sum(((locate(v, poses) - true[name]) / MM) ** 2, axis=-1)
             places[name] = np.sqrt(np.mean(squares, axis=1))
         left = (np.abs(v - truth) / units)[:, errors > 0.0]
         ratio = left / errors[errors > 0.0]
@@ -555,11 +551,11 @@ def _compare_table_4(setup: Setup) -> published.Comparison:
 def list_replaced(results: Results) -> tuple[str, ...]:
     """Return sentences on a rule that is replaced, and on what belongs to the paper's robot."""
     setup, printed = results.setup, PRINTED.number("threshold", "value")
-    data = {"epsilon": setup.epsilon, "printed": printed, "robot": setup.robot.name,
-            "noise": PRINTED.number("noise", "value")}  # fmt: skip
     is_replaced = {"epsilon": setup.epsilon != printed, "robot": not setup.is_printed}
-    texts = published.PaperFile(__file__, "text.yaml").find("replaced")
-    return tuple(fill_template(texts[key], **data) for key, yes in is_replaced.items() if yes)
+    return TEXT.list_replaced(
+        filter(is_replaced.get, is_replaced), epsilon=setup.epsilon, printed=printed,
+        robot=setup.robot.name, noise=PRINTED.number("noise", "value"),
+    )  # fmt: skip
 
 
 def make_tables(results: Results) -> tuple[published.Table, ...]:

@@ -52,7 +52,7 @@ IDENTIFIED = (
     (WHITENED, 6), (PRIOR, 6), (PRIOR, 5),
 )  # fmt: skip
 # Tables of the paper with identified parameters and with output errors.
-TABLES = {"RU-PUS-PRS": (5, 7), "3-PRS": (6, 8)}
+TABLES = {"identified": {"RU-PUS-PRS": 5, "3-PRS": 6}, "outputs": {"RU-PUS-PRS": 7, "3-PRS": 8}}
 # Figures of the paper with curves over lambda and k.
 FIGURES = {("RU-PUS-PRS", 6): 6, ("RU-PUS-PRS", 5): 8, ("3-PRS", 6): 10, ("3-PRS", 5): 11}
 # Figures of the paper with parameters by iteration, RU-PUS-PRS, by measured coordinates.
@@ -221,10 +221,7 @@ def _list_outputs(draws: Draws) -> published.Table:
             end = (None, DIVERGED) if sweep.is_diverged(method) else (count, is_converged)
             label = (f"{sweep.study.freedoms}-DOF", method, sweep.describe_setting(method))
             rows.append((*label, *show_errors(design, errors), *end))
-    number = TABLES.get(design.printed, ("", ""))[1]
-    file = f"table_{number}" if number else f"outputs_{design.file}"
-    data = describe_design(design) | {"name": design.name, "number": number}
-    return TEXT.table("outputs", rows, file, **data)
+    return _show_table("outputs", design, rows)
 
 
 def make_medians(draws: Draws) -> published.Table:
@@ -243,7 +240,7 @@ def make_medians(draws: Draws) -> published.Table:
             cells += [shown, None if shown is None else " to ".join(ends)]
         lost = int(np.isinf(errors[:, 0]).sum())
         rows.append((measured, method, *cells, show_number(middle[3]), lost, end))
-    data = describe_design(study.design) | {"name": study.name, "trials": len(draws[0])}
+    data = describe_design(study.design) | {"name": study.design.name, "trials": len(draws[0])}
     return TEXT.table("draws", rows, f"draws_{study.design.file}", **data)
 
 
@@ -258,10 +255,15 @@ def _list_identified(draws: Draws) -> published.Table:
             else show_all(to_paper_units(study, sweep.chosen[method].values[0]))
         )  # fmt: skip
     rows = [(*label, *row) for label, *row in zip(list_labels(study), *columns, strict=True)]
-    number = TABLES.get(study.design.printed, ("", ""))[0]
-    file = f"table_{number}" if number else f"identified_{study.design.file}"
-    data = describe_design(study.design) | {"name": study.name, "number": number}
-    return TEXT.table("identified", rows, file, **data)
+    return _show_table("identified", study.design, rows)
+
+
+def _show_table(name: str, design: steps.Design, rows: Iterable[Sequence[Any]]) -> published.Table:
+    """Return a table of the first machine, in place of one of the paper for its manipulators."""
+    number = TABLES[name].get(design.printed)
+    file = f"table_{number}" if number else f"{name}_{design.file}"
+    data = describe_design(design) | {"name": design.name, "number": number or ""}
+    return TEXT.table(name, rows, file, **data)
 
 
 def make_curves(sweep: Sweep) -> published.Table:
@@ -543,10 +545,15 @@ def _compare_best(sweep: Sweep) -> Held:
     parts = sweep.study.design.parts
     errors = {name: sweep.chosen[a].errors[:, parts] for name, a in NAMES.items()}
     tsvd, others = errors["tsvd"], (errors["ls"], errors["ridge"])
-    medians = {name: np.median(sweep.chosen[a].errors, axis=0) for name, a in SHOWN.items()}
     holds = np.all([(tsvd <= other).all(axis=1) for other in others], axis=0)
     fails = np.any([_are_better(other, tsvd) for other in others], axis=0)
-    return Held(holds, fails, format_all(parts, **medians))
+    return Held(holds, fails, _show_medians(sweep, SHOWN))
+
+
+def _show_medians(sweep: Sweep, names: Mapping[str, str]) -> dict[str, str]:
+    """Return name -> median errors of an algorithm in position and angle as text."""
+    return {name: format_errors(sweep.study.design.parts, np.median(sweep.chosen[a].errors, axis=0))
+            for name, a in names.items()}  # fmt: skip
 
 
 def _compare_five(sweep: Sweep) -> Held:
@@ -572,7 +579,7 @@ def _compare_exact(draws: Draws) -> Held:
     limit = SIZES.find("reached") * study.before[:, 3]
     six, five = (sweep.exact[:, 3] for sweep in draws)
     row = {"six": float(np.median(six)), "five": float(np.median(five)),
-           **format_all(study.design.parts, left=left)}  # fmt: skip
+           "left": format_errors(study.design.parts, left)}  # fmt: skip
     is_decided = (six <= limit) & np.isfinite(five)
     return Held(is_decided & (five > limit), is_decided & (five <= limit), row)
 
@@ -629,18 +636,16 @@ def _compare_ranked(draws: Draws) -> Held:
     parts = draws[0].study.design.parts
     six, five = draws[0].chosen[LS].errors, draws[1].chosen[RANKED].errors
     holds = _are_better(five[:, parts], six[:, parts], 1.1)
-    medians = {"six": np.median(six, axis=0), "five": np.median(five, axis=0)}
-    return Held(holds, ~holds, format_all(parts, **medians))
+    row = _show_medians(draws[0], {"six": LS}) | _show_medians(draws[1], {"five": RANKED})
+    return Held(holds, ~holds, row)
 
 
 def _compare_prior(sweep: Sweep) -> Held:
     """Compare MAP with the paper's methods at their best."""
-    parts = sweep.study.design.parts
-    errors = {name: sweep.chosen[a].errors for name, a in {**SHOWN, "prior": PRIOR}.items()}
-    holds = np.all([_are_better(errors["prior"][:, parts], errors[name][:, parts])
-                    for name in NAMES], axis=0)  # fmt: skip
-    medians = {name: np.median(of, axis=0) for name, of in errors.items()}
-    return Held(holds, ~holds, format_all(parts, **medians))
+    prior, *raw = (sweep.chosen[a].errors[:, sweep.study.design.parts]
+                   for a in (PRIOR, *NAMES.values()))  # fmt: skip
+    holds = np.all([_are_better(prior, errors) for errors in raw], axis=0)
+    return Held(holds, ~holds, _show_medians(sweep, {**SHOWN, "prior": PRIOR}))
 
 
 def _find_best_k(sweep: Sweep) -> Held:
@@ -702,13 +707,11 @@ def _judge_noise(noise: published.Printed) -> published.Verdict:
     )  # fmt: skip
 
 
-def format_all(parts: tuple[int, ...], **errors: FloatArray) -> dict[str, str]:
+def format_errors(parts: tuple[int, ...], errors: FloatArray) -> str:
     """Return errors in position and angle, as far as the platform has them, as text."""
-    return {
-        name: " / ".join(f"{e[i]:.2g} {('mm', 'deg')[i]}" for i in parts)
-        if np.isfinite(e[[*parts]]).all() else DIVERGED
-        for name, e in errors.items()
-    }  # fmt: skip
+    if not np.isfinite(errors[[*parts]]).all():
+        return DIVERGED
+    return " / ".join(f"{errors[i]:.2g} {('mm', 'deg')[i]}" for i in parts)
 
 
 def format_pair(values: FloatArray) -> str:
@@ -721,7 +724,6 @@ def list_replaced(results: Results) -> tuple[str, ...]:
     if not results.is_adapted:
         return ()
     design, of_paper = results.design, steps.load_design("3-PRS")
-    sentences = published.PaperFile(__file__, "text.yaml").find("replaced")
     ranges = {
         "measured": list_ranges(design, design.poses),
         "range": list_ranges(design, design.output_range),
@@ -734,4 +736,4 @@ def list_replaced(results: Results) -> tuple[str, ...]:
     is_fixed = "psi" not in design.columns
     kept = ["poses", "range", "settings", *(["fixed"] if is_fixed else [])]
     kept += ["no_tilt"] if not is_fixed and 1 not in design.parts else []
-    return tuple(published.fill_template(sentences[name], **data) for name in kept)
+    return TEXT.list_replaced(kept, **data)

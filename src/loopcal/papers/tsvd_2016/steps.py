@@ -18,6 +18,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -185,11 +186,6 @@ class Study:
     freedoms: int = len(COLUMNS)  # measured coordinates of a pose
 
     @property
-    def name(self) -> str:
-        """Name of the structure."""
-        return self.design.name
-
-    @property
     def robot(self) -> Mechanism:
         """As designed."""
         return self.design.robot
@@ -197,7 +193,7 @@ class Study:
     @property
     def label(self) -> str:
         """Structure and measurement."""
-        return f"{self.name}, {self.freedoms}-DOF"
+        return f"{self.design.name}, {self.freedoms}-DOF"
 
     @property
     def file(self) -> str:
@@ -267,8 +263,8 @@ class Study:
         """Return errors (a, 5) of poses over the output range, at equal readings, and of
         parameters, see MEASURES. psi counts in none: the paper considers it unnecessary.
 
-        values : (a, p) identified [SI]; NaN rows give NaN. machine : (a,) of which machine;
-        default: one row each.
+        values : (a, p) identified [SI]. NaN rows are diverged machines, which count as infinitely
+        wrong, so that medians stay honest. machine : (a,) of which machine; default: one row each.
         """
         is_finite = np.isfinite(values).all(axis=1, keepdims=True)
         machine = np.arange(len(values)) if machine is None else machine
@@ -279,7 +275,7 @@ class Study:
         parameters, worse = (off / free.tolerance) ** 2, np.abs(off) > np.abs(before)
         sizes = np.sqrt(parameters.mean(axis=1)), worse.mean(axis=1)
         errors = np.column_stack([_compare_poses(T, self.true_outputs[machine]), *sizes])
-        return np.where(is_finite, errors, np.nan)
+        return np.where(is_finite, errors, np.inf)
 
 
 def _compare_poses(T: FloatArray, reference: FloatArray) -> FloatArray:
@@ -423,13 +419,8 @@ class Chosen:
         is_converged: BoolArray,
     ) -> Chosen:  # fmt: skip
         """Return identified machines with their errors."""
-        errors = mark_diverged(study.compute_output_errors(values))
+        errors = study.compute_output_errors(values)
         return cls(settings, values, iterations, is_converged, errors)
-
-
-def mark_diverged(errors: FloatArray) -> FloatArray:
-    """Count diverged machines as infinitely wrong, so that medians stay honest."""
-    return np.where(np.isnan(errors), np.inf, errors)
 
 
 @dataclass(frozen=True, eq=False)
@@ -528,7 +519,7 @@ def run_settings(study: Study, progress: Callable[[str], None] = lambda _: None)
             place = np.searchsorted(steps.done.max(axis=1), SHORT)
             early = steps.history[min(int(place), len(steps.done) - 1)]
             errors = [study.compute_output_errors(v, machine) for v in (steps.values, early)]
-            arrays = (*map(mark_diverged, errors), steps.values, early, steps.count,
+            arrays = (*errors, steps.values, early, steps.count,
                       np.minimum(steps.count, SHORT), steps.is_converged,
                       steps.is_converged & (steps.count <= SHORT))  # fmt: skip
             parts.append([x.reshape(len(of), -1, *x.shape[1:]) for x in arrays])
@@ -568,7 +559,7 @@ def run_settings(study: Study, progress: Callable[[str], None] = lambda _: None)
         counts={a: of[2] for a, of in found.items()},
         chosen=chosen,
         runs=iterate(study, np.concatenate(pictured), ahead=FINE),
-        exact=mark_diverged(exact.compute_output_errors(free.values)),
+        exact=exact.compute_output_errors(free.values),
     )
 
 
@@ -579,14 +570,12 @@ def follow_ridge(sweep: Sweep) -> list[tuple[int | str, float, bool, FloatArray]
     study, counts, lambdas = sweep.study, SIZES.find("ridge_steps"), list_lambdas("fine")
     penalty = penalize_ridge(lambdas, len(study.design.free))
     history = iterate(study, penalty, limit=max(counts), ahead=0.0).history
-    machine, curves = np.zeros(len(lambdas), dtype=np.int64), dict[int | str, FloatArray]()
+    machine, found = np.zeros(len(lambdas), dtype=np.int64), list[tuple[int | str, Any, Any]]()
     for count in counts:
         values = history[min(count, len(history) - 1)]
-        curves[count] = mark_diverged(study.compute_output_errors(values, machine))
-    found = {count: (lambdas, curve) for count, curve in curves.items()}
-    found["all"] = sweep.settings[RE], sweep.curves[RE][0]
+        found.append((count, lambdas, study.compute_output_errors(values, machine)))
     rows = []
-    for count, (settings, errors) in found.items():
+    for count, settings, errors in (*found, ("all", sweep.settings[RE], sweep.curves[RE][0])):
         best = int(locate_bottoms(errors[None], study.design.parts)[0, -1])
         is_at_end = best in (0, len(settings) - 1)
         rows.append((count, float(settings[best]), is_at_end, errors[best]))
