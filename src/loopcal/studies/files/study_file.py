@@ -45,9 +45,8 @@ from loopcal.studies.specification import (
     BLOCK,
     FACTORS,
     PER_LEG,
-    EffectsLevel,
+    CellContent,
     ErrorsLevel,
-    InstrumentLevel,
     MethodLevel,
     NoiseLevel,
     PosesLevel,
@@ -57,17 +56,10 @@ from loopcal.studies.specification import (
     check_question,
 )
 
-# Factor -> record of its levels.
+# Factor -> record of its levels, of those that are not robots.
 LEVELS: Mapping[str, type] = {
-    "instruments": InstrumentLevel,
-    "noise": NoiseLevel,
-    "poses": PosesLevel,
-    "errors": ErrorsLevel,
-    "methods": MethodLevel,
-    "effects": EffectsLevel,
+    key: get_field_types(CellContent)[name] for key, name in FACTORS.items() if key != "robots"
 }
-
-
 SETTINGS = tuple(item.name for item in fields(StudySettings))
 QUICK = "quick"
 

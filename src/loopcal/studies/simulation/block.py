@@ -41,35 +41,7 @@ from loopcal.mechanism.sensitivity import differentiate_pose
 from loopcal.mechanism.solutions import forward
 from loopcal.mechanism.states import Status
 from loopcal.numerics.gauss_newton import DescentStatus
-from loopcal.studies.simulation.machines import (
-    CellPoses,
-    PreparedCell,
-    compute_poses,
-    describe_poses,
-    draw_machines,
-    hide_columns,
-    make_disturbance,
-    make_fit_options,
-    measure_held_points,
-    prepare_cell,
-    share_content,
-)
-from loopcal.studies.simulation.published_steps import (
-    EPSILON,
-    LEG_STEPS,
-    LIMIT,
-    WEIGHTS,
-    PaperRows,
-    PerLegEstimate,
-    StepRule,
-    Weights,
-    identify_from_rows,
-    identify_per_leg,
-    make_raw_problem,
-    penalize_ridge,
-    penalize_truncated,
-    take_steps,
-)
+from loopcal.studies.simulation import machines, published_steps
 from loopcal.studies.specification import (
     PER_LEG,
     MethodLevel,
@@ -143,7 +115,7 @@ class FittedTrials:
     states: tuple[State, State] | None = None
 
 
-def fit_trials(cell: PreparedCell, trials: Trials, threads: int = 1) -> FittedTrials:
+def fit_trials(cell: machines.PreparedCell, trials: Trials, threads: int = 1) -> FittedTrials:
     """Calibrate all trials; threads compute those that are one batch."""
     options, scores = cell.fit_options, cell.content.scores
     if cell.content.method.is_published:
@@ -154,7 +126,7 @@ def fit_trials(cell: PreparedCell, trials: Trials, threads: int = 1) -> FittedTr
     return fit_each(cell, trials)
 
 
-def fit_together(cell: PreparedCell, trials: Trials, threads: int = 1) -> FittedTrials:
+def fit_together(cell: machines.PreparedCell, trials: Trials, threads: int = 1) -> FittedTrials:
     """Calibrate all trials as one batch. The stated noise counts as known.
 
     The fits begin with chords, see `identify_trials`: estimates are those of single fits within
@@ -179,26 +151,27 @@ def fit_together(cell: PreparedCell, trials: Trials, threads: int = 1) -> Fitted
     )
 
 
-def fit_per_leg(robot: Mechanism, data: Measurements, method: MethodLevel) -> PerLegEstimate:
+def fit_per_leg(
+    robot: Mechanism, data: Measurements, method: MethodLevel
+) -> published_steps.PerLegEstimate:
     """Fit leg by leg. EstimationError as of `identify_per_leg`."""
-    steps, epsilon = method.steps or LEG_STEPS, method.epsilon or 0.0
-    return identify_per_leg(robot, data, steps, epsilon, method.stop or "dQint")
+    steps, epsilon = method.steps or published_steps.LEG_STEPS, method.epsilon or 0.0
+    return published_steps.identify_per_leg(robot, data, steps, epsilon, method.stop or "dQint")
 
 
-def fit_published(cell: PreparedCell, trials: Trials) -> FittedTrials:
+def fit_published(cell: machines.PreparedCell, trials: Trials) -> FittedTrials:
     """Calibrate all trials by a method of published studies, whose intervals do not exist; a trial
     that fails does not stop the others.
 
     Raises DataError: products of points that are not held on planes and lines.
     """
-    method, robot, t = cell.content.method, cell.robot, len(trials)
-    scores: dict[str, Any] = {}
+    method, robot, fits = cell.content.method, cell.robot, refuse_all(cell, len(trials))
+    values, outcome, scores = fits.values, fits.outcome, dict[str, Any]()
     if method.is_of_products:
         values, outcome, iterations, scores["rank"] = _fit_products(cell, trials)
     elif method.method == PER_LEG:
-        values = np.full((t, len(robot.parameters)), np.nan)
-        outcome, iterations = np.full(t, REFUSED), np.zeros(t, dtype=np.int64)
-        for i in range(t):
+        iterations = np.zeros(len(trials), dtype=np.int64)
+        for i in range(len(trials)):
             with suppress(EstimationError, DataError):
                 fit = fit_per_leg(robot, trials.trial(i), method)
                 values[i], outcome[i] = fit.robot.values, 0 if fit.is_converged else STEPS_REMAIN
@@ -206,31 +179,25 @@ def fit_published(cell: PreparedCell, trials: Trials) -> FittedTrials:
     else:
         names = select_free_parameters(robot).names
         ridge = Ridge(method.lam or 0.0).resolve(names)
-        raw = make_raw_problem(robot, trials, ridge)
-        p = len(names)
-        penalty = np.zeros((1, p))
-        if method.method == "ridge":
-            lam = 1.0 if isinstance(ridge.lam, tuple) else ridge.lam
-            penalty = penalize_ridge(np.array([lam]), p)
-        elif method.method == "truncated-svd":
-            penalty = penalize_truncated(np.array([method.keep]), p)
+        raw = published_steps.make_raw_problem(robot, trials, ridge)
+        lam = 1.0 if isinstance(ridge.lam, tuple) else ridge.lam  # 0 of least squares
+        penalty = published_steps.penalize_ridge(np.array([lam]), len(names))
+        if method.method == "truncated-svd":
+            penalty = published_steps.penalize_truncated(np.array([method.keep]), len(names))
         is_counted = method.epsilon is None and method.steps is not None
-        epsilon = 0.0 if is_counted else method.epsilon or EPSILON
-        steps = take_steps(raw, penalty, StepRule(epsilon, method.steps or LIMIT))
+        epsilon = 0.0 if is_counted else method.epsilon or published_steps.EPSILON
+        steps = published_steps.take_steps(
+            raw, penalty, published_steps.StepRule(epsilon, method.steps or published_steps.LIMIT)
+        )
         outcome = np.where(steps.is_converged | is_counted, 0, STEPS_REMAIN)
         outcome = np.where(steps.is_diverged, DIVERGED, outcome)
         values, iterations = steps.values, steps.count
-    return FittedTrials(
-        values=values,
-        outcome=outcome,
-        half_width=np.full((t, len(select_free_parameters(robot))), np.nan),
-        expanded=np.full((t, len(cell.held_out.q), 2), np.nan),
-        scores=scores | {"iterations": iterations.astype(float)},
-    )
+    scores["iterations"] = iterations.astype(float)
+    return replace(fits, values=values, outcome=outcome, scores=scores)
 
 
 def _fit_products(
-    cell: PreparedCell, trials: Trials
+    cell: machines.PreparedCell, trials: Trials
 ) -> tuple[FloatArray, IntArray, IntArray, FloatArray]:
     """Return values, outcomes, iterations and ranks of fits to products of points, with the
     library's descent.
@@ -244,15 +211,17 @@ def _fit_products(
     free, sd = select_free_parameters(robot), np.zeros(len(robot.parameters))
     sd[free.places] = free.tolerance
     sigma = float(trials.instrument.sensors[0].noise.sigma[0])
-    stated: list[Weights] = [w for w in WEIGHTS if method.rows == f"products-{w}"]
-    weights: Weights = stated[0] if stated else "full"
-    chosen = make_fit_options(method).method
+    stated: list[published_steps.Weights] = [
+        w for w in published_steps.WEIGHTS if method.rows == f"products-{w}"
+    ]
+    weights: published_steps.Weights = stated[0] if stated else "full"
+    chosen = machines.make_fit_options(method).method
     assert trials.recorded is not None
     assert chosen is not None
     if isinstance(chosen, Ridge):
         chosen = chosen.resolve(robot.parameters.names)
-    rows = PaperRows(cell.layout, trials.recorded, sd, sigma, weights)
-    fit = identify_from_rows(rows, chosen)
+    rows = published_steps.PaperRows(cell.layout, trials.recorded, sd, sigma, weights)
+    fit = published_steps.identify_from_rows(rows, chosen)
     outcome = np.where(fit.status == DescentStatus.CONVERGED, 0, EXHAUSTED)
     rank = fit.decomposition.rank.astype(float)
     return rows.values(fit.deviation), outcome, fit.iterations, rank
@@ -264,7 +233,7 @@ def compute_noise(chi_square: ArrayLike, degrees: ArrayLike) -> FloatArray:
     return np.sqrt(np.asarray(chi_square) / np.where(left > 0.0, left, np.nan))
 
 
-def solve_cell_poses(cell: PreparedCell, values: FloatArray) -> tuple[State, State]:
+def solve_cell_poses(cell: machines.PreparedCell, values: FloatArray) -> tuple[State, State]:
     """Return the states of machines (t, p) at the readings of the held-out poses, and at those of
     the measured poses, see `PreparedCell.reference`; those of lost trials do not count.
     """
@@ -283,7 +252,7 @@ def is_reached(state: State) -> BoolArray:
 
 
 def _expand_errors(
-    cell: PreparedCell, fits: IdentifiedTrials, state: State, measured: State
+    cell: machines.PreparedCell, fits: IdentifiedTrials, state: State, measured: State
 ) -> FloatArray:
     """Return what 95 % of the errors of held-out poses do not exceed (t, h, 2) [m], [rad], as
     `pose_uncertainty` does for one machine.
@@ -319,31 +288,28 @@ def _expand_errors(
     return np.stack(lengths, axis=-1).reshape(t, n, 2)
 
 
-def fit_each(cell: PreparedCell, trials: Trials) -> FittedTrials:
+def fit_each(cell: machines.PreparedCell, trials: Trials) -> FittedTrials:
     """Calibrate the trials one by one, each with all that its calibration finds in the residuals.
 
     A trial that is refused does not stop the others.
     """
-    free = select_free_parameters(cell.robot)
-    nothing = FittedTrials(
-        values=np.full(len(cell.robot.parameters), np.nan),
-        outcome=np.array(REFUSED),
-        half_width=np.full(len(free), np.nan),
-        expanded=np.full((len(cell.held_out.q), 2), np.nan),
-        scores={},
-    )
-    single = []
+    fits, scores = refuse_all(cell, len(trials)), dict[str, FloatArray]()
     for i in range(len(trials)):
-        try:
-            single.append(_fit_one(cell, state_times(trials.trial(i))))
-        except (EstimationError, DataError):
-            single.append(nothing)
-    names = ("values", "outcome", "half_width", "expanded")
-    arrays = [np.stack([getattr(fit, name) for fit in single]) for name in names]
-    known = dict.fromkeys(name for fit in single for name in fit.scores)
-    scores = {name: np.array([f.scores.get(name, np.nan) for f in single]) for name in known}
-    values, outcome, half_width, expanded = arrays
-    return FittedTrials(values, outcome, half_width, expanded, scores)
+        with suppress(EstimationError, DataError):
+            one = _fit_one(cell, state_times(trials.trial(i)))
+            for name in ("values", "outcome", "half_width", "expanded"):
+                getattr(fits, name)[i] = getattr(one, name)
+            for name, score in one.scores.items():
+                scores.setdefault(name, np.full(len(trials), np.nan))[i] = score
+    return replace(fits, scores=scores)
+
+
+def refuse_all(cell: machines.PreparedCell, t: int) -> FittedTrials:
+    """Return t trials that are refused, without numbers."""
+    shapes = len(cell.robot.parameters), len(select_free_parameters(cell.robot))
+    values, half_width = (np.full((t, count), np.nan) for count in shapes)
+    expanded = np.full((t, len(cell.held_out.q), 2), np.nan)
+    return FittedTrials(values, np.full(t, REFUSED), half_width, expanded, {})
 
 
 def state_times(data: Measurements) -> Measurements:
@@ -356,7 +322,7 @@ def state_times(data: Measurements) -> Measurements:
     return replace(data, observations=observations)
 
 
-def _fit_one(cell: PreparedCell, data: Measurements) -> FittedTrials:
+def _fit_one(cell: machines.PreparedCell, data: Measurements) -> FittedTrials:
     """Return the calibration of one trial, without the axis of trials."""
     asked, scores = cell.content.scores, dict[str, Any]()
     if asked.verdict:
@@ -440,23 +406,23 @@ def compute_block(task: BlockTask, threads: int = 1) -> FloatArray:
     return np.stack(columns, axis=1)
 
 
-def compute_task(task: BlockTask | PosesTask, threads: int = 1) -> FloatArray | CellPoses:
+def compute_task(task: BlockTask | PosesTask, threads: int = 1) -> FloatArray | machines.CellPoses:
     """Compute a block, see `compute_block`, or poses."""
     return compute_plan(task) if isinstance(task, PosesTask) else compute_block(task, threads)
 
 
-def compute_plan(task: PosesTask) -> CellPoses:
+def compute_plan(task: PosesTask) -> machines.CellPoses:
     """Draw or plan poses."""
-    return compute_poses(json.loads(task.content))
+    return machines.compute_poses(json.loads(task.content))
 
 
 def make_poses_task(content: Mapping[str, Any]) -> PosesTask:
     """Return the task of the poses of a block, from its description."""
-    description = describe_poses(content)
+    description = machines.describe_poses(content)
     return PosesTask(compute_key(description), format_json(description))
 
 
-def make_block_task(cell: int, content: Mapping[str, Any], poses: CellPoses) -> BlockTask:
+def make_block_task(cell: int, content: Mapping[str, Any], poses: machines.CellPoses) -> BlockTask:
     """Return the task of a block of a cell, from its description and its poses."""
     complete = format_json({**content, **vars(poses)})
     return BlockTask(compute_key(content), cell, content["block"], complete)
@@ -468,7 +434,7 @@ def list_tasks(
     """Yield the tasks of these blocks of these cells, of all by default. The poses of a cell are
     drawn or planned here; the driver of a study leaves them to workers.
     """
-    known = dict[str, CellPoses]()
+    known = dict[str, machines.CellPoses]()
     for number in range(len(study.cells)) if cells is None else cells:
         of_cell = describe_cell(study, study.cells[number])
         task = make_poses_task(of_cell)
@@ -480,9 +446,12 @@ def list_tasks(
 
 def calibrate_block(
     content: Mapping[str, Any], threads: int = 1
-) -> tuple[PreparedCell, Trials, FittedTrials]:
+) -> tuple[machines.PreparedCell, Trials, FittedTrials]:
     """Simulate and calibrate the machines of the content of a task, by so many threads."""
-    cell, trials = prepare_cell(content), _simulate(format_json(share_content(content, "block")))
+    cell, trials = (
+        machines.prepare_cell(content),
+        _simulate(format_json(machines.share_content(content, "block"))),
+    )
     return cell, trials, fit_trials(cell, trials, threads)
 
 
@@ -492,7 +461,7 @@ def _simulate(text: str) -> Trials:
     its `share_content`, as JSON.
     """
     content = json.loads(text)
-    cell = prepare_cell(content)
+    cell = machines.prepare_cell(content)
     return simulate_block(cell, make_stream(cell.content.seed, content["block"]))
 
 
@@ -507,23 +476,23 @@ def make_stream(seed: int, block: int) -> BlockStream:
     return BlockStream(int.from_bytes(digest[:16], "little"), block)
 
 
-def simulate_block(cell: PreparedCell, stream: BlockStream) -> Trials:
+def simulate_block(cell: machines.PreparedCell, stream: BlockStream) -> Trials:
     """Draw the true machines of a block and measure them; with a verdict, also held-out poses."""
     poses = cell.measured
     if cell.content.scores.verdict:
         poses = np.concatenate([poses, np.array(cell.content.held_out)])
-    truth = draw_machines(cell.robot, cell.content.errors, cell.content.trials, stream)
+    truth = machines.draw_machines(cell.robot, cell.content.errors, cell.content.trials, stream)
     if cell.layout is not None:
-        return measure_held_points(cell.layout, truth, cell.instrument, stream)
-    disturbance = make_disturbance(cell.robot, truth, poses, cell.content.effects, stream)
+        return machines.measure_held_points(cell.layout, truth, cell.instrument, stream)
+    disturbance = machines.make_disturbance(cell.robot, truth, poses, cell.content.effects, stream)
     trials = simulate_trials(
         cell.robot, truth, poses, cell.instrument, stream, disturbance=disturbance
     )
-    return hide_columns(trials, cell.content.instrument.unused)
+    return machines.hide_columns(trials, cell.content.instrument.unused)
 
 
 def score_poses(
-    cell: PreparedCell, trials: Trials, fits: FittedTrials, stream: BlockStream
+    cell: machines.PreparedCell, trials: Trials, fits: FittedTrials, stream: BlockStream
 ) -> dict[str, FloatArray]:
     """Return the outcome, the errors of held-out poses before and after calibration, and how many
     lie within their expanded uncertainty.
@@ -563,7 +532,7 @@ def score_poses(
 
 
 def score_parameters(
-    cell: PreparedCell, trials: Trials, fits: FittedTrials
+    cell: machines.PreparedCell, trials: Trials, fits: FittedTrials
 ) -> dict[str, FloatArray]:
     """Return the errors of the free parameters, and how many lie in their intervals."""
     free = select_free_parameters(cell.robot)
@@ -597,7 +566,7 @@ def compute_share(error: FloatArray, limit: FloatArray) -> FloatArray:
 
 
 def _fit_motions(
-    cell: PreparedCell, trials: Trials, T: FloatArray, measured: FloatArray
+    cell: machines.PreparedCell, trials: Trials, T: FloatArray, measured: FloatArray
 ) -> FloatArray:
     """Return the errors (t, h, 6) of the tool at platform poses T (t | 1, h, 4, 4) that motions of
     frames explain: those that fit the errors of the measured poses (t | 1, n, 4, 4) best.
@@ -688,7 +657,7 @@ def set_size(study: Study, seed: int, trials: int) -> Study:
 
 def replay_trial(
     study: Study, cell: int, trial: int
-) -> tuple[PreparedCell, Mechanism, Measurements]:
+) -> tuple[machines.PreparedCell, Mechanism, Measurements]:
     """Return the cell, the true machine and the measurements of a trial, to the last bit; trials of
     a cell are numbered from 0, over all of its blocks.
 
@@ -705,7 +674,7 @@ def replay_trial(
     block, place = divmod(trial, study.block)
     (task,) = list_tasks(study, [cell], blocks=[block])
     content = json.loads(task.content)
-    prepared = prepare_cell(content)
+    prepared = machines.prepare_cell(content)
     trials = simulate_block(prepared, make_stream(prepared.content.seed, block))
     data = state_times(trials.trial(place))
     if prepared.content.scores.verdict:

@@ -55,6 +55,7 @@ from loopcal.studies.specification import (
     NoiseLevel,
     PosesLevel,
     ThermalGrowth,
+    describe_record,
     format_json,
 )
 from loopcal.typing import FloatArray
@@ -203,9 +204,8 @@ def measure_held_points(
 
 def check_effects(effects: EffectsLevel) -> None:
     """Raise DataError for effects that held points do not have."""
-    plain = EffectsLevel()
     for name in ("drift", "jump", "thermal", "backlash"):
-        if getattr(effects, name) != getattr(plain, name):
+        if name in describe_record(effects):
             raise DataError(
                 f"a simulation of points on planes and lines takes no {name}. Remove it"
             )
@@ -339,9 +339,7 @@ class AlteredNoise(Noise):
 
 def alter_noise(instrument: Instrument, effects: EffectsLevel) -> Instrument:
     """Return an instrument whose true noise is that of the effects; its stated one is the same."""
-    plain = EffectsLevel()
-    names = ("noise", "degrees", "correlation", "outliers")
-    if all(getattr(effects, name) == getattr(plain, name) for name in names):
+    if describe_record(effects).keys().isdisjoint(("noise", "degrees", "correlation", "outliers")):
         return instrument
     sensors = tuple(
         replace(sensor, noise=AlteredNoise(sensor.noise, effects)) for sensor in instrument.sensors

@@ -626,14 +626,11 @@ class PaperRows:
         d_1, d = self.layout.levers
         B = map_displacements(d_1, d)
         unit = np.broadcast_to(np.eye(d.shape[1]), (*d.shape[:2], d.shape[1]))
-        sd = self.sigma * np.linalg.norm(B, axis=2)
-        if self.weights == "printed":
-            return unit / np.sqrt(np.mean(sd**2))
-        if self.weights == "distance":
-            length = np.linalg.norm(d_1, axis=1)[:, None]
-            return unit / (length * np.sqrt(np.mean((sd / length) ** 2)))[..., None]
-        if self.weights == "single":
-            return unit / sd[..., None]
+        if self.weights != "full":
+            sd, length = self.sigma * np.linalg.norm(B, axis=2), np.linalg.norm(d_1, axis=1)
+            each = {"printed": np.ones((1, 1)), "distance": length[:, None], "single": sd}
+            size = each[self.weights]
+            return unit / (size * np.sqrt(np.mean((sd / size) ** 2)))[..., None]
         covariance = self.sigma**2 * B @ np.swapaxes(B, 1, 2)
         return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)), dtype=np.float64)
 
