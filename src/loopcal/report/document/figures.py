@@ -16,18 +16,7 @@ from loopcal.estimate.result import KindResiduals
 from loopcal.measure.kinds.joints import ActuatorReadings
 from loopcal.numerics.statistics import choose_evenly
 from loopcal.report.document.elements import CalibrationRecord, Element, Picture
-from loopcal.report.figures.fit_figures import (
-    draw_correlation_matrix,
-    draw_parameter_rows,
-    draw_residual_arrows,
-    draw_residual_rows,
-)
-from loopcal.report.figures.result_figures import (
-    draw_accuracy_map,
-    draw_budget_sources,
-    draw_height_errors,
-    draw_validation,
-)
+from loopcal.report.figures import fit_figures, result_figures
 from loopcal.report.pictures import inline_figure
 from loopcal.report.scene.scene import (
     Motion,
@@ -98,7 +87,7 @@ def draw_residual_picture(record: CalibrationRecord) -> Iterator[Element]:
         yield say("residual-figure.part", shown=shown, count=count)
     setup = [row["name"] for row in record.result["fit"]["local"]]
     yield show_figure(
-        draw_residual_rows(record.robot, residuals, setup),
+        fit_figures.draw_residual_rows(record.robot, residuals, setup),
         "residual-figure",
         has_readings=any(rows.kind == ActuatorReadings.name for rows in residuals),
     )
@@ -110,7 +99,9 @@ def draw_arrow_picture(record: CalibrationRecord) -> Iterator[Element]:
     seen = [rows for rows in record.residuals if set(rows.dimensions) == {Dimension.PIXEL}]
     if seen and record.converged:
         count = sum(len(rows.raw) for rows in seen)
-        drawn = draw_residual_arrows(record.robot.name, [thin_rows(rows, count) for rows in seen])
+        drawn = fit_figures.draw_residual_arrows(
+            record.robot.name, [thin_rows(rows, count) for rows in seen]
+        )
         yield show_figure(drawn, "arrow-figure")
 
 
@@ -141,7 +132,7 @@ def draw_validation_picture(record: CalibrationRecord) -> Iterator[Element]:
     if len(errors.poses) > MOST_ROWS:
         yield say("validation-figure.many", count=len(errors.poses))
     else:
-        yield show_figure(draw_validation(errors), "validation-figure")
+        yield show_figure(result_figures.draw_validation(errors), "validation-figure")
 
 
 @report_figure("heights")
@@ -153,7 +144,7 @@ def draw_height_picture(record: CalibrationRecord) -> Iterator[Element]:
     if len(heights.poses) > MOST_ROWS:
         yield say("height-figure.many", count=len(heights.poses))
     else:
-        yield show_figure(draw_height_errors(heights), "height-figure")
+        yield show_figure(result_figures.draw_height_errors(heights), "height-figure")
 
 
 @report_figure("budget")
@@ -161,7 +152,7 @@ def draw_budget_picture(record: CalibrationRecord) -> Iterator[Element]:
     """Yield the sources of the expected error as bars."""
     budget = record.result.get("expected_error")
     if budget and budget["sources"]:
-        yield show_figure(draw_budget_sources(budget), "budget-figure")
+        yield show_figure(result_figures.draw_budget_sources(budget), "budget-figure")
 
 
 @report_figure("workspace")
@@ -228,7 +219,7 @@ def draw_accuracy_picture(record: CalibrationRecord) -> Iterator[Element]:
         compared=is_part and MOST_ROWS,
         frame=accuracy.uncertainty.frame,
     )
-    yield show_figure(draw_accuracy_map(accuracy), "accuracy-figure")
+    yield show_figure(result_figures.draw_accuracy_map(accuracy), "accuracy-figure")
 
 
 @lru_cache(maxsize=1)  # two figures use it
@@ -253,8 +244,8 @@ def draw_parameter_picture(record: CalibrationRecord) -> Iterator[Element]:
     if len(rows) > MOST_PARAMETERS:
         yield say("parameter-figure.many", count=len(rows))
         return
-    yield show_figure(draw_parameter_rows(record.robot.name, rows), "parameter-figure")
+    yield show_figure(fit_figures.draw_parameter_rows(record.robot.name, rows), "parameter-figure")
     if len(rows) > 1:
         names, covariance = [row["name"] for row in rows], record.arrays["covariance"]
-        matrix = draw_correlation_matrix(record.robot.name, names, covariance)
+        matrix = fit_figures.draw_correlation_matrix(record.robot.name, names, covariance)
         yield show_figure(matrix, "correlation-figure")

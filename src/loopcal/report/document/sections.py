@@ -18,17 +18,8 @@ from loopcal.errors import DataError, suggest_names
 from loopcal.findings import sort_by_importance
 from loopcal.findings.wording import list_names, name_count
 from loopcal.mechanism.model import Mechanism
-from loopcal.report.calibration_view import (
-    COMBINATIONS,
-    MOST_COMBINATIONS,
-    build_budget_table,
-    build_gum_tables,
-    build_height_map,
-    build_height_summary,
-    build_last_value_table,
-    build_parameter_table,
-    build_share_table,
-)
+from loopcal.report import calibration_view, validation_view
+from loopcal.report.document import figures
 from loopcal.report.document.elements import (
     CalibrationRecord,
     Code,
@@ -40,30 +31,12 @@ from loopcal.report.document.elements import (
     Section,
     list_options,
 )
-from loopcal.report.document.figures import (
-    FIGURES,
-    compute_accuracy,
-    draw_figures,
-    draw_scene_picture,
-    make_picture,
-    show_figure,
-)
 from loopcal.report.figures.result_figures import (
     draw_run_errors,
     draw_run_parameters,
     draw_run_shifts,
 )
 from loopcal.report.scene.scene import Scene, draw_scene, format_scene
-from loopcal.report.validation_view import (
-    build_errors,
-    build_estimates,
-    build_shifts,
-    describe_commanded,
-    describe_improvements,
-    list_runs,
-    view_error_statistics,
-    view_errors,
-)
 from loopcal.report.words import say
 from loopcal.results.tables import (
     ABSENT,
@@ -97,7 +70,7 @@ def build_sections(record: CalibrationRecord, names: Iterable[str]) -> tuple[Sec
 
     DataError : a figure belongs to a section that does not exist.
     """
-    for name in FIGURES.values():
+    for name in figures.FIGURES.values():
         if name not in SECTIONS:
             raise DataError(
                 f"a figure belongs to the section {name!r}, which the report does not have"
@@ -109,7 +82,7 @@ def build_sections(record: CalibrationRecord, names: Iterable[str]) -> tuple[Sec
         described = list(describe(record))
         elements: list[Element] = []
         for element in described if None in described else [*described, None]:
-            elements += draw_figures(name, record) if element is None else [element]
+            elements += figures.draw_figures(name, record) if element is None else [element]
         sections.append(Section(name, title, tuple(elements)))
     return tuple(section for section in sections if section.elements)
 
@@ -239,10 +212,10 @@ def describe_verdict(record: CalibrationRecord) -> Iterator[Element]:
     budget = result.get("expected_error")
     if budget and result.get("states_expected_error"):
         yield budget["finding"]["text"]
-        yield build_share_table(budget)
+        yield calibration_view.build_share_table(budget)
     judged = [f for f in record.findings if f["code"].startswith(CONFORMITY)]
     if judged and record.validation is not None:
-        yield from filter(None, [describe_commanded(record.validation)])
+        yield from filter(None, [validation_view.describe_commanded(record.validation)])
     yield from list_findings(f for f in select_important(record.findings) if f not in judged)
     if recommendation := result["recommendation"]:
         yield f"Recommendation: {recommendation['text']}"
@@ -284,9 +257,13 @@ def describe_errors(record: CalibrationRecord) -> Iterator[Element | None]:
     explained = say("errors.baseline", is_stated_frame="stated frame" in errors.frame)
     noted = [say("errors.reading-noise")] if record.result.get("reading_errors") else []
     yield " ".join((explained, *noted))
-    yield from view_errors(errors, "held-out")
-    yield from filter(None, [" ".join(describe_improvements(errors))])
-    yield from (table for table in view_error_statistics(errors) if not isinstance(table, str))
+    yield from validation_view.view_errors(errors, "held-out")
+    yield from filter(None, [" ".join(validation_view.describe_improvements(errors))])
+    yield from (
+        table
+        for table in validation_view.view_error_statistics(errors)
+        if not isinstance(table, str)
+    )
 
 
 @describes_section("heights", "Height errors")
@@ -294,9 +271,9 @@ def describe_heights(record: CalibrationRecord) -> Iterator[Element | None]:
     """Yield the errors of heights over x and y, where heights were measured."""
     if record.heights is not None:
         yield say("errors.heights")
-        yield build_height_summary(record.heights)
+        yield calibration_view.build_height_summary(record.heights)
         yield None
-        yield build_height_map(record.heights)
+        yield calibration_view.build_height_map(record.heights)
 
 
 @describes_section("repeatability", "Pose accuracy and repeatability")
@@ -343,8 +320,8 @@ def describe_budget(record: CalibrationRecord) -> Iterator[Element]:
         yield say("budget.terms")
         if not record.result.get("states_expected_error"):
             yield say("budget.not-expected")
-        yield from build_gum_tables(budget, record.robot)
-        yield build_budget_table(budget, record.robot)
+        yield from calibration_view.build_gum_tables(budget, record.robot)
+        yield calibration_view.build_budget_table(budget, record.robot)
     stated = (record.result.get("volume") or {}).get("findings", ())
     yield from (f["text"] for f in stated if not f["code"].startswith(CONFORMITY))
     instruments = record.result.get("instruments") or ()
@@ -364,14 +341,16 @@ def describe_parameters(record: CalibrationRecord) -> Iterator[Element | None]:
     """
     fit = record.result["fit"]
     if not record.converged:
-        yield build_last_value_table(fit["parameters"])
+        yield calibration_view.build_last_value_table(fit["parameters"])
     else:
         yield say("parameters.terms")
-        yield build_parameter_table("Identified parameters", fit["parameters"], is_complete=True)
+        yield calibration_view.build_parameter_table(
+            "Identified parameters", fit["parameters"], is_complete=True
+        )
         if fit.get("interval_note"):
             yield fit["interval_note"]
         if fit.get("local"):
-            yield build_parameter_table("Setup parameters", fit["local"])
+            yield calibration_view.build_parameter_table("Setup parameters", fit["local"])
     yield None  # figures before text, which fills what they leave of a page
     yield from select_findings(record, OF_PARAMETERS)
 
@@ -386,8 +365,8 @@ def describe_open_combinations(record: CalibrationRecord) -> Iterator[Element]:
     known = ("all" if rank == count else "some") if record.converged else "not-converged"
     yield say(f"determined.{known}", rank=rank, count=count)
     stated = [finding for finding in record.findings if finding["code"].startswith(OPEN)]
-    found = [finding for finding in stated if finding["code"] in COMBINATIONS]
-    shown = [f for f in found if not f["data"].get("meaning")][:MOST_COMBINATIONS]
+    found = [finding for finding in stated if finding["code"] in calibration_view.COMBINATIONS]
+    shown = [f for f in found if not f["data"].get("meaning")][: calibration_view.MOST_COMBINATIONS]
     yield from list_findings(f for f in stated if f in shown or f not in found)
     if others := len(found) - len(shown):
         yield say("determined.others", others=others)
@@ -533,18 +512,21 @@ def build_comparison_document(comparison: RunComparison, made_by: str) -> Docume
     if findings := sort_by_importance(comparison.findings):  # the most important first
         result.append(Listing(tuple((f.severity.value, str(f)) for f in findings)))
     columns = (word_column(title, wraps=True) for title in ("run", "robot, verdict, method"))
-    result.append(make_table("The compared runs", columns, list_runs(comparison)))
-    estimates = show_figure(draw_run_parameters(comparison), "estimates-figure")
+    result.append(make_table("The compared runs", columns, validation_view.list_runs(comparison)))
+    estimates = figures.show_figure(draw_run_parameters(comparison), "estimates-figure")
     shifts: list[Element] = [say("comparison.no-shift")]
     if any(pair.moved is not None for pair in comparison.pairs):
-        figure = show_figure(draw_run_shifts(comparison), "shift-figure")
-        shifts = [figure, build_shifts(comparison)]
-    errors: list[Element] = [build_errors(comparison)]
+        figure = figures.show_figure(draw_run_shifts(comparison), "shift-figure")
+        shifts = [figure, validation_view.build_shifts(comparison)]
+    errors: list[Element] = [validation_view.build_errors(comparison)]
     if any(run.common or run.own for run in comparison.errors):
-        errors.append(show_figure(draw_run_errors(comparison), "errors-figure"))
+        errors.append(figures.show_figure(draw_run_errors(comparison), "errors-figure"))
     sections: dict[tuple[str, str], list[Element]] = {
         ("result", "Changes of the machine"): result,
-        ("parameters", "Parameters side by side"): [build_estimates(comparison), estimates],
+        ("parameters", "Parameters side by side"): [
+            validation_view.build_estimates(comparison),
+            estimates,
+        ],
         ("shifts", "Shifts in standard deviations"): shifts,
         ("errors", "Held-out errors"): errors,
     }
@@ -573,8 +555,8 @@ def build_robot_view(robot: Mechanism) -> Document:
 
 def build_calibration_view(record: CalibrationRecord) -> Document:
     """Return the view of a calibration; of a fit that did not converge, the robot before it."""
-    elements = [*draw_scene_picture(record)]
-    if record.converged and isinstance(reason := compute_accuracy(record), str):
+    elements = [*figures.draw_scene_picture(record)]
+    if record.converged and isinstance(reason := figures.compute_accuracy(record), str):
         elements.append(reason)
     if all(isinstance(element, str) for element in elements):
         elements.append(_draw_home(record.robot if record.converged else record.initial))
@@ -586,7 +568,7 @@ def build_calibration_view(record: CalibrationRecord) -> Document:
 def _draw_home(robot: Mechanism) -> Picture:
     """Return a robot at home."""
     scene = Scene(robot)
-    return make_picture(
+    return figures.make_picture(
         draw_scene(scene),
         "scene-figure",
         say("home-figure.caption"),
