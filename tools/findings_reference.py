@@ -39,7 +39,7 @@ is the text, and an error has the `code` of its finding. In JSON, the keys are `
 
 The table has the first sentence of each message. The message itself continues with numbers, the
 reason or the next step. Words in *italics* stand for data, and sentences in quotation marks are
-examples. A sentence that begins with a small letter is a part of another message. The last column
+examples. A sentence that begins with a small letter is a part of another message. A second line
 adds what the message leaves out: its condition, and what to do.
 """
 
@@ -52,6 +52,11 @@ def describe_text(entry: Entry) -> str:
     return PLACEHOLDER.sub(lambda match: f"*{match['name'].replace('_', ' ')}*", first)
 
 
+def describe_circumstances(entry: Entry) -> str:
+    """Return when an entry is reported and what to do, as far as its text does not say it."""
+    return f"{entry.when} {fill_template(entry.action, **entry.example)}".strip()
+
+
 def write_page() -> str:
     """Return docs/findings.md."""
     severities = [(f"`{severity.value}`", words) for severity, words in SEVERITIES.items()]
@@ -61,13 +66,12 @@ def write_page() -> str:
             (
                 f"`{e.code}`",
                 e.severity.value,
-                describe_text(e),
-                f"{e.when} {fill_template(e.action, **e.example)}".strip(),
+                "<br>".join(filter(None, (describe_text(e), describe_circumstances(e)))),
             )
             for e in catalog.read_entries(file).values()
         ]
         sections.append(f"## {catalog.read_document(file)['title']}\n")
-        sections.append(format_table(("code", "severity", "text", "when, and what to do"), rows))
+        sections.append(format_table(("code", "severity", "text"), rows))
     return "\n".join(sections)
 
 
