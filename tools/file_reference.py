@@ -253,8 +253,8 @@ def format_provenance() -> str:
 
 def format_limits() -> str:
     """Return what a file may contain at most."""
-    rows = [(limit.of, str(limit), limit.meaning) for limit in LIMITS]
-    return format_table(("limit", "at most", "applies to"), rows)
+    rows = [(limit.of, str(limit)) for limit in LIMITS]
+    return format_table(("of", "at most"), rows)
 
 
 def format_profile() -> str:

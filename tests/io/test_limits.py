@@ -23,7 +23,7 @@ from loopcal.io.robot.robot_file import find_robot_file, load_robot
 from loopcal.io.runs.run_folder import read_arrays
 
 FIVE_BAR = find_robot_file("five-bar").read_text("utf-8")
-SMALL = limits.FileLimit("size", 0.01, "MB", "a test", "shorten it")
+SMALL = limits.FileLimit("size", 0.01, "MB", "shorten it")
 
 
 def write(folder: Path, text: str, name: str = "file.yaml") -> Path:
@@ -47,7 +47,7 @@ def test_file_without_a_stated_size_is_read_up_to_the_limit() -> None:
     if not Path("/proc/self/smaps").exists():
         pytest.skip("this system has no /proc")
     with pytest.raises(FileError, match=r"has more than 0.01 MB, which is the limit"):
-        read_text("/proc/self/smaps", "robot file", limit=limits.FileLimit("", 0.01, "MB", ""))
+        read_text("/proc/self/smaps", "robot file", limit=limits.FileLimit("", 0.01, "MB"))
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no pipes with names")
@@ -183,7 +183,7 @@ def test_zip_bomb_is_refused_before_it_is_expanded(tmp_path) -> None:
     bomb = npy(np.zeros(10**6))
     with pytest.raises(ValueError, match=r"compression of 'x\.npy'"):
         read_arrays(archive(tmp_path, {"x": bomb}, zipfile.ZIP_DEFLATED))
-    limit = limits.FileLimit("", 1, "MB", "", "repeat the calibration")
+    limit = limits.FileLimit("", 1, "MB", "repeat the calibration")
     with pytest.raises(FileError, match=r"8\.01 MB, but the limit is 1"):
         read_arrays(archive(tmp_path, {"x": bomb}, zipfile.ZIP_DEFLATED), size=limit)
     many = {f"m{i}": b"" for i in range(1001)}

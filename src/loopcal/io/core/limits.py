@@ -33,14 +33,12 @@ MEGABYTE = 10**6
 class FileLimit:
     """The most that a file may contain of one thing: `most` of it, in `unit`; sizes are in MB.
 
-    `of` and `meaning` say what is limited and where, for documentation; `action` is what a user
-    who meets the limit does.
+    `of` says what is limited, for documentation; `action` is what a user who meets the limit does.
     """
 
     of: str
     most: float
     unit: str
-    meaning: str
     action: str = ""
 
     def __str__(self) -> str:
@@ -83,159 +81,122 @@ def _format(value: float) -> str:
 
 
 YAML_SIZE = FileLimit(
-    "size of YAML text",
+    "size of YAML text with its remarks: robot files, settings, profiles, loop closures",
     1,
     "MB",
-    "robot files, settings, profiles, lists of loop closures, front matter with its remarks",
     "shorten its comments, or remove what does not belong there",
 )
 YAML_NODES = FileLimit(
-    "values in YAML text",
+    "keys, values and lists of YAML text. An alias counts as all values that it stands for",
     50_000,
     "values",
-    "keys, values and lists. An alias counts as all values that it stands for",
     "write less, or use fewer aliases",
 )
 YAML_DEPTH = FileLimit(
-    "nesting of YAML text",
+    "lists and mappings of YAML inside each other",
     50,
     "levels of nesting",
-    "lists and mappings inside each other",
     "write it with fewer levels",
 )
-COPIES = FileLimit("copies of a limb", MOST_COPIES, "copies", "`copies: {count: ..}` of a limb")
-LIMBS = FileLimit("limbs of a robot", MOST_LIMBS, "limbs", "copies included")
-JOINTS = FileLimit("joints of a limb", MOST_JOINTS, "joints", "a universal joint counts as two")
-ACTUATORS = FileLimit("actuators of a robot", MOST_ACTUATORS, "actuators", "of all limbs together")
-PARAMETERS = FileLimit(
-    "parameters of a robot", MOST_PARAMETERS, "parameters", "including fixed ones"
-)
+COPIES = FileLimit("`copies: {count: ..}` of a limb", MOST_COPIES, "copies")
+LIMBS = FileLimit("limbs of a robot, copies included", MOST_LIMBS, "limbs")
+JOINTS = FileLimit("joints of a limb. A universal joint counts as two", MOST_JOINTS, "joints")
+ACTUATORS = FileLimit("actuators of all limbs together", MOST_ACTUATORS, "actuators")
+PARAMETERS = FileLimit("parameters of a robot, fixed ones included", MOST_PARAMETERS, "parameters")
 NAME_LENGTH = FileLimit(
-    "length of a name",
-    200,
-    "characters",
-    "robots, limbs, actuators, sessions, targets, and every other text of a YAML file",
-    "shorten it",
+    "names, and every other text of a YAML file", 200, "characters", "shorten it"
 )
 COMPOSED_LENGTH = FileLimit(
-    "length of a composed name",
+    "names such as `monday.tracker.x`, headers of columns, names of poses",
     1_000,
     "characters",
-    "names such as `monday.tracker.x`, headers of columns, names of poses",
     "shorten it",
 )
-TEXT_LENGTH = FileLimit(
-    "length of a text that is not a name", 10_000, "characters", "`source` of a robot", "shorten it"
-)
+TEXT_LENGTH = FileLimit("`source` of a robot", 10_000, "characters", "shorten it")
 TABLE_SIZE = FileLimit(
-    "size of a measurement file",
+    "measurement files, exports of instruments, `result.json` of a run",
     500,
     "MB",
-    "measurement files, exports of instruments, `result.json` of a run",
     "divide it into several files",
 )
 TABLE_ROWS = FileLimit(
-    "rows of a measurement file",
+    "rows of a measurement file below the header",
     2_000_000,
     "rows",
-    "rows below the header",
     "divide it into several files, or average repeated measurements",
 )
 TABLE_LINES = FileLimit(
-    "lines of a measurement file",
+    "lines of a measurement file, blank ones and remarks included",
     5_000_000,
     "lines",
-    "blank lines and remarks included",
     "remove other lines, or divide it into several files",
 )
 TABLE_COLUMNS = FileLimit(
     "columns of a measurement file",
     1_000,
     "columns",
-    "columns of the header",
     "leave out columns that loopcal does not read",
 )
 LINE_LENGTH = FileLimit(
-    "length of a line of a table",
+    "a line of a measurement file or an export",
     100_000,
     "characters in one line",
-    "lines of measurement files and exports",
     "check that this is a table of text, one row in a line",
 )
 PATTERN_LENGTH = FileLimit(
-    "length of a pattern of a profile",
-    1_000,
-    "characters",
-    "`match` and `ignore`",
-    "write a shorter pattern",
+    "a pattern of a profile (`match`, `ignore`)", 1_000, "characters", "write a shorter pattern"
 )
 PATTERN_COUNTS = FileLimit(
-    "repetitions in a pattern of a profile",
+    "product of all counts in braces of a pattern: 8 for `\\d{4}-\\d{2}`",
     1_000,
     "repetitions",
-    "the product of all counts in braces: 8 for `\\d{4}-\\d{2}`",
     "write smaller counts, or `*` and `+`",
 )
 PATTERN_SECONDS = FileLimit(
-    "time of the patterns of a profile",
-    2,
-    "seconds",
-    "for one export, and 0.1 ms more for each of its lines",
+    "the patterns of an export, and 0.1 ms more for each of its lines", 2, "seconds"
 )
 PROGRAM_SIZE = FileLimit(
-    "size of a file of another program",
+    "files of other programs that `loopcal import` and `loopcal export` read",
     5,
     "MB",
-    "files that `loopcal import` and `loopcal export` read",
     "check that this is the right file, or remove other content",
 )
 JSON_VALUES = FileLimit(
-    "values in JSON text",
+    "`result.json` of a run and samples of a cable robot, keys included",
     25_000_000,
     "values",
-    "`result.json` of a run, samples of a cable robot, keys included",
     "check that this is the file that was meant",
 )
 JSON_DEPTH = FileLimit(
-    "nesting of JSON text",
-    200,
-    "levels of nesting",
-    "lists and objects inside each other",
-    "simplify it",
+    "lists and objects of JSON inside each other", 200, "levels of nesting", "simplify it"
 )
 XML_JOINTS = FileLimit(
-    "joints of a URDF",
+    "joints of a URDF, fixed ones included",
     300,
     "joints",
-    "fixed ones included",
     "leave out joints that belong to no loop",
 )
 XML_ELEMENTS = FileLimit(
-    "elements of a URDF",
+    "elements of a URDF of every kind",
     20_000,
     "elements",
-    "elements of every kind",
     "leave out what loopcal does not read, such as visuals",
 )
 XML_DEPTH = FileLimit(
-    "nesting of a URDF",
+    "elements of a URDF inside each other",
     50,
     "levels of nesting",
-    "elements inside each other",
     "check that this is the file that was meant",
 )
 ARRAYS_SIZE = FileLimit(
-    "size of `arrays.npz`",
+    "`arrays.npz` of a run folder, as a file and in memory, never compressed",
     4_000,
     "MB",
-    "arrays of a run folder, as a file and in memory, never compressed",
     "repeat the calibration with fewer poses",
 )
-ARRAYS_COUNT = FileLimit(
-    "arrays of a run folder", 1_000, "arrays", "members of `arrays.npz`", "repeat the calibration"
-)
-UPLOAD_SIZE = FileLimit("size of a file of the page", 50, "MB", "`loopcal app`", "divide it")
-UPLOADS = FileLimit("files of the page", 50, "files", "`loopcal app`", "remove one")
+ARRAYS_COUNT = FileLimit("arrays in `arrays.npz`", 1_000, "arrays", "repeat the calibration")
+UPLOAD_SIZE = FileLimit("a file of `loopcal app`", 50, "MB", "divide it")
+UPLOADS = FileLimit("files of `loopcal app`", 50, "files", "remove one")
 
 # All limits, in the order of docs/files.md.
 LIMITS = tuple(value for value in vars().values() if isinstance(value, FileLimit))
