@@ -738,6 +738,7 @@ FREE = frozenset({"title", "order", "questions"})  # keys that change no number
 # Factor -> setting that says where a level was read.
 NAMES_OF_FILES = {"robots": "source", "poses": "file"}
 LONGEST = 40  # characters of a value that is shown
+REMOVED: Any = object()  # in place of a level that a study does not have any more
 
 
 def list_conflicts(old: str, new: str) -> tuple[str, ...]:
@@ -747,37 +748,26 @@ def list_conflicts(old: str, new: str) -> tuple[str, ...]:
     More replicates, further levels, other names of files with the same content, and another title,
     order or question are none.
     """
-    return tuple(_compare(json.loads(old), json.loads(new)))
+    before, after = json.loads(old), json.loads(new)
+    after |= {key: before[key] for key in FREE}
+    after["replicates"] = min(after["replicates"], before["replicates"])
+    for key in FACTORS:
+        after[key] = {level: after[key].get(level, REMOVED) for level in before[key]}
+        for level in (*before[key].values(), *after[key].values()):
+            if level is not REMOVED:
+                level.pop(NAMES_OF_FILES.get(key), None)  # its content counts
+    return tuple(_compare("", before, after))
 
 
-def _compare(old: dict[str, Any], new: dict[str, Any]) -> Iterator[str]:
-    for key in dict.fromkeys((*old, *new)):
-        before: Any = old.get(key)
-        after: Any = new.get(key)
-        if key in FREE:
-            continue
-        if key == "replicates":
-            if after < before:
-                yield f"replicates: {before} -> {after} (allowed: more)"
-        elif key in FACTORS:
-            for level in before:
-                if level not in after:
-                    yield f"{key}/{level}: removed"
-                    continue
-                file = {NAMES_OF_FILES.get(key): None}  # its content counts
-                yield from _compare_values(
-                    f"{key}/{level}", before[level] | file, after[level] | file
-                )
-        else:
-            yield from _compare_values(key, before, after)
-
-
-def _compare_values(path: str, old: Any, new: Any) -> Iterator[str]:
+def _compare(path: str, old: Any, new: Any) -> Iterator[str]:
     """Yield the differences of two values, with their places."""
     if isinstance(old, dict) and isinstance(new, dict):
         for key in dict.fromkeys((*old, *new)):
-            yield from _compare_values(f"{path}/{key}", old.get(key), new.get(key))
+            yield from _compare(f"{path}/{key}".lstrip("/"), old.get(key), new.get(key))
+    elif new is REMOVED:
+        yield f"{path}: removed"
     elif old != new:
         texts = [json.dumps(value, ensure_ascii=False) for value in (old, new)]
         is_short = all(len(text) <= LONGEST for text in texts)
-        yield f"{path}: {texts[0]} -> {texts[1]}" if is_short else f"{path}: changed"
+        more = " (allowed: more)" if path == "replicates" else ""
+        yield f"{path}: {texts[0]} -> {texts[1]}{more}" if is_short else f"{path}: changed"
