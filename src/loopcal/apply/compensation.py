@@ -45,13 +45,7 @@ from loopcal.findings.wording import name_count
 from loopcal.geometry import align_point_sets, wrap_angle
 from loopcal.mechanism.assembly import AXES, TWIST_UNITS
 from loopcal.mechanism.model import Mechanism
-from loopcal.mechanism.platform_coordinates import (
-    POSITION,
-    TILT,
-    get_dimension,
-    list_dimensions,
-    read_coordinates,
-)
+from loopcal.mechanism.platform_coordinates import POSITION, TILT, list_dimensions, read_coordinates
 from loopcal.mechanism.sensitivity import differentiate_pose
 from loopcal.mechanism.solutions import Solution, are_poses, forward, inverse, list_commanded
 from loopcal.mechanism.states import Status
@@ -518,7 +512,7 @@ def make_tables(
     controller : the geometry that it computes with. limit : error that may remain [m], of an
     orientation by its arc at the robot's size; a tenth of the largest error by default.
 
-    DataError : the controller errs nowhere or has other coordinates, or a node is out of reach.
+    DataError : the controller errs nowhere, has other coordinates, or reaches no node.
     """
     names, reason = robot.controlled, ""
     if set(names) & set(TILT):
@@ -566,9 +560,23 @@ def make_tables(
     return tuple(tables), _report(machine, size, tables, (before, after), limit)
 
 
-def _refuse(robot: Mechanism, reason: str, point: str = "") -> Finding:
+def _refuse(robot: Mechanism, reason: str) -> Finding:
     """Return why there is no table of a robot."""
-    return report_finding("files.no-table", robot=robot.name, reason=reason, point=point)
+    return report_finding("files.no-table", robot=robot.name, reason=reason)
+
+
+def _extend(points: FloatArray, values: FloatArray, is_known: BoolArray) -> None:
+    """Fill in the values (n, c) at points (n, d) out of reach, such as corners of a round bed: by
+    the plane through the nearest known ones.
+    """
+    from scipy.spatial import KDTree
+
+    known, lost = points[is_known], points[~is_known]
+    count = min(4 * points.shape[1], len(known))
+    near = KDTree(known).query(lost, count)[1].reshape(-1, count)
+    steps = known[near] - lost[:, None]
+    planes = np.concatenate([np.ones((*near.shape, 1)), steps], axis=2)
+    values[~is_known] = (np.linalg.pinv(planes) @ values[is_known][near])[:, 0]
 
 
 def _report(
@@ -622,12 +630,12 @@ def _choose_grid(
         commands = targets.copy()
         for _ in range(STEPS):
             commands[:, columns] -= machine.lead(targets, commands)[:, columns]
-        lost = np.flatnonzero(~np.isfinite(commands).all(axis=1))
-        if len(lost):
-            pairs = zip(machine.robot.controlled, targets[lost[0]].tolist(), strict=True)
-            found = [f"{n} {machine.robot.to_quantity(v, get_dimension(n))}" for n, v in pairs]
-            raise DataError(_refuse(machine.robot, "reach", ", ".join(found)))
-        grid = (commands - targets)[:, columns].reshape(*counts, len(columns))
+        is_known: BoolArray = np.asarray(np.isfinite(commands).all(axis=1))
+        if not is_known.any():
+            raise DataError(_refuse(machine.robot, "nowhere"))
+        grid = (commands - targets)[:, columns]
+        _extend(points / [node[1] - node[0] for node in nodes], grid, is_known)
+        grid = grid.reshape(*counts, len(columns))
         correct = RegularGridInterpolator(nodes, grid)
 
         def remain(points: FloatArray) -> FloatArray:
