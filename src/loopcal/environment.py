@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import sys
 from collections.abc import Iterator
@@ -37,16 +38,22 @@ PINNED = dict.fromkeys(THREADS, "1") | {
     "NoDefaultCurrentDirectoryInExePath": "1",
 }
 
+# Beginnings of the names of variables at which numpy and matplotlib fail, or print something.
+REMOVED = ("MPLBACKEND", "NPY_PROMOTION_STATE", "NUMPY_", "OPENBLAS_VERBOSE", "SOURCE_DATE_EPOCH")
+
 
 def pin_settings() -> None:
     """Let libraries of this process read settings from nowhere but their own packages.
 
-    Variables are pinned. matplotlib looks for `matplotlibrc` in the current folder
+    Variables are pinned or removed. matplotlib looks for `matplotlibrc` in the current folder
     first, then at MATPLOTLIBRC, then in the folder of the user: it gets its own file. Where the
     current folder has such a file, matplotlib is imported in another one.
     """
     os.environ.update(PINNED)
-    os.environ.pop("MPLBACKEND", None)
+    for name in [name for name in os.environ if name.startswith(REMOVED)]:
+        del os.environ[name]
+    # what matplotlib says about a folder for its list of fonts is not the user's concern
+    logging.getLogger("matplotlib").addHandler(logging.NullHandler())
     package = find_spec("matplotlib")
     if package is None or package.origin is None:
         return

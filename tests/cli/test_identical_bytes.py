@@ -69,9 +69,11 @@ OTHER = {
     "LANG": "de_DE.UTF-8",
     "OMP_NUM_THREADS": "4",
     "OPENBLAS_NUM_THREADS": "4",
-    "SOURCE_DATE_EPOCH": "86400",
+    "SOURCE_DATE_EPOCH": "no number",
+    "NUMPY_MADVISE_HUGEPAGE": "no number",
     "COLUMNS": "80",
     "MPLBACKEND": "no backend",
+    "MPLCONFIGDIR": "/dev/null",
     "MATPLOTLIBRC": "no file",
 }
 SETTINGS = b"text.usetex: True\nfont.family: serif\nsavefig.dpi: 30\naxes.facecolor: red\n\xff\n"
