@@ -158,6 +158,12 @@ JOINT = '<joint name="a" type="revolute"><origin xyz="0 0 1"/><parent link="base
         ),
         (
             "<robot><link name='base'/><link name='arm'/>\n"
+            + JOINT.replace('axis xyz="0', 'axis xyz="one')
+            + "</robot>",
+            ":2: the axis of joint 'a' is 'one', but must be a finite number",
+        ),
+        (
+            "<robot><link name='base'/><link name='arm'/>\n"
             + JOINT.replace("revolute", "planar")
             + "</robot>",
             ":2: joint 'a' is of type",

@@ -24,6 +24,7 @@ from loopcal.errors import FileError, suggest_names
 from loopcal.io.core.limits import XML_DEPTH, XML_ELEMENTS, XML_JOINTS, find_fault
 from loopcal.io.formats.program_format import parse_number
 from loopcal.typing import FloatArray
+from loopcal.units import NUMBER
 
 ROUNDED = 4
 """Decimals from which a number counts as rounded, such as 1.5708 for a right angle."""
@@ -127,12 +128,12 @@ def measure_rounding(lengths: Iterable[str], angles: Iterable[str]) -> tuple[flo
 
     Rounding errors are uniform in half a unit, so that this is 3.5 times the standard deviation of
     their sum. A number with fewer than ROUNDED decimals is a dimension that somebody chose, and is
-    exact.
+    exact. What is no number is refused elsewhere.
     """
 
     def measure(texts: Iterable[str]) -> float:
         units = []
-        for number in " ".join(texts).lower().split():
+        for number in filter(NUMBER.fullmatch, " ".join(texts).lower().split()):
             mantissa, _, exponent = number.partition("e")
             decimals = len(mantissa.partition(".")[2]) - float(exponent or 0)
             units.append(10.0**-decimals if decimals >= ROUNDED else 0.0)
