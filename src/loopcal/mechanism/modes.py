@@ -202,21 +202,16 @@ def _subtract_turns(robot: Mechanism, state: State) -> State:
     )
     _, tau = robot.slots(robot.values[None])
     center = joints_from_readings(middle[None, None], tau, robot.slots.constants)[0, 0]
-    turns = np.round((driven_values(robot.program, state) - center) / (2 * np.pi))
+    driven = driven_values(robot.program, state)
+    turns = np.round((driven - center) / (2 * np.pi))
     for group in robot.program.groups:
         for j, columns in enumerate(group.actuator):
             # a slide or a screw has moved after a full turn
             repeats = group.joints[j : j + 1] == "R" and not group.pitch[:, j].any()
             if columns[0] >= 0 and not repeats:
                 turns[..., columns] = 0.0
-    joints = []
-    for group, old in zip(robot.program.groups, state.joints, strict=True):
-        new = np.array(old)
-        for j, columns in enumerate(group.actuator):
-            if columns[0] >= 0:
-                new[..., j] -= 2 * np.pi * turns[..., columns]
-        joints.append(new)
-    return replace(state, joints=tuple(joints))
+    moved, own = driven - 2 * np.pi * turns, zip(robot.program.groups, state.joints, strict=True)
+    return replace(state, joints=tuple(group.insert_driven(old, moved) for group, old in own))
 
 
 def _search(
@@ -247,22 +242,16 @@ def _merge(
     modes: State, hits: IntArray, new: State, identify: Callable[[State], FloatArray]
 ) -> tuple[State, IntArray]:
     """Return the modes together with those of new solutions, and how often each was reached."""
-    keys, known = identify(new), identify(modes)
-    rest = np.arange(len(keys))
-    for i, mode in enumerate(known):
-        same = np.abs(keys[rest] - mode).max(axis=1, initial=0.0) < SAME
-        hits[i] += same.sum()
-        rest = rest[~same]
-    first, counts = [], []
+    whole, counts = join_states(modes, new), np.ones(len(hits) + new.T.shape[1], np.int64)
+    keys, rest, first = identify(whole), np.arange(len(counts)), []
+    counts[: len(hits)] = hits
     while len(rest):
         same = np.abs(keys[rest] - keys[rest[0]]).max(axis=1) < SAME
+        counts[rest[0]] = counts[rest[same]].sum()
         first.append(rest[0])
-        counts.append(int(same.sum()))
         rest = rest[~same]
-    if not first:
-        return modes, hits
-    whole = join_states(modes, select_poses(new, np.array(first)))
-    return whole, np.concatenate([hits, np.array(counts, np.int64)])
+    chosen = np.array(first, np.int64)
+    return select_poses(whole, chosen), counts[chosen]
 
 
 def _draw_starts(robot: Mechanism, rng: np.random.Generator, n: int) -> State:

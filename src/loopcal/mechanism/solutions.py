@@ -165,7 +165,6 @@ SAME_POSE = 1e-7
 
 Rounding grows close to a singularity, up to the square root of the machine precision.
 """
-STEPS = 4  # steps of the path from the start's pose to a target
 
 Solver = Callable[[FloatArray, State | None], tuple[State, BoolArray | None]]
 """Solves inverse kinematics for targets (n, ..) from a start: states (1, n), and where the engine
@@ -189,27 +188,16 @@ def solve_in_mode(
     state = replace(state, status=status)
     if has_one_solution(robot) or moves_by_drives(robot):  # which follows the path itself
         return state
-    begin = repeat_poses(begin, len(is_other))
-    near, arrived = _follow_poses(robot, select_poses(begin, rows), select_poses(state, rows))
-    near, rows = _select_new(robot, near, state, rows[arrived])
+    begin = select_poses(repeat_poses(begin, len(is_other)), rows)
+    path = _move_poses(robot, begin, select_poses(state, rows))
+    near, arrived = _follow_path(robot, begin, path)
+    begin, rows = select_poses(begin, arrived), rows[arrived]
     if not len(rows):
         return state
-    again, rows = _select_new(robot, solve(target[rows], near)[0], state, rows)
-    if not len(rows):
-        return state
-    again, still_other = judge_modes(robot, again, select_poses(begin, rows))
+    again, _ = solve(target[rows], select_poses(near, arrived))
+    again, still_other = judge_modes(robot, again, begin)
     good = (again.status[0] == Status.CONVERGED) & ~still_other
     return put_poses(state, rows[good], select_poses(again, good))
-
-
-def _select_new(
-    robot: Mechanism, again: State, state: State, rows: IntArray
-) -> tuple[State, IntArray]:
-    """Return the solutions (1, k) of rows (k,) that are not those of a state, and their rows."""
-    if not len(rows):
-        return again, rows
-    is_new = measure_distance(robot, again, select_poses(state, rows)) > SAME_JOINTS
-    return select_poses(again, is_new), rows[is_new]
 
 
 def has_one_solution(robot: Mechanism) -> bool:
@@ -328,21 +316,6 @@ def _judge_paths(robot: Mechanism, first: State, goal: State) -> tuple[State, Bo
         is_other[rows] = ~arrived
         rows = rows[~arrived]
     return goal, is_other
-
-
-def _follow_poses(robot: Mechanism, first: State, goal: State) -> tuple[State, IntArray]:
-    """Return solutions (1, k) close to the poses of goals (1, n), reached from the start (1, n) in
-    equal steps, and which of these rows arrived (k,).
-    """
-    alive, current = np.arange(goal.T.shape[1]), first
-    step = _move_poses(robot, first, goal)
-    for i in range(1, STEPS + 1):
-        current = step(alive, np.full(len(alive), i / STEPS), current)
-        closed = current.status[0] == Status.CONVERGED
-        current, alive = select_poses(current, closed), alive[closed]
-        if not len(alive):
-            break
-    return current, alive
 
 
 # Residual [m] of a converged row above which its redundant readings contradict each other.

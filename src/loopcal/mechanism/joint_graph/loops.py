@@ -125,26 +125,6 @@ class JointGraph:
         return {body: i for i, body in enumerate(self.bodies)}
 
     @cached_property
-    def _carriers(self) -> list[int]:
-        """Return the number of the first body of each joint of the tree."""
-        return [self._index[joint.body_a] for joint in self.tree]
-
-    @cached_property
-    def _axes(self) -> FloatArray:
-        """Axes (j, 3) of the joints of the tree in their frames."""
-        return np.reshape([joint.axis for joint in self.tree], (-1, 3))
-
-    @cached_property
-    def _frames(self) -> FloatArray:
-        """Frames (j, 4, 4) of the joints of the tree in their first bodies."""
-        return np.reshape([joint.T_a for joint in self.tree], (-1, 4, 4))
-
-    @cached_property
-    def _back(self) -> FloatArray:
-        """Second bodies (j, 4, 4) of the joints of the tree in the frames of the joints."""
-        return geometry.invert_pose(np.reshape([joint.T_b for joint in self.tree], (-1, 4, 4)))
-
-    @cached_property
     def _is_below(self) -> BoolArray:
         """Which joints (j,) of the tree move each body (bodies, j)."""
         below = np.zeros((len(self.bodies), len(self.tree)), dtype=bool)
@@ -156,25 +136,25 @@ class JointGraph:
     def place(self, q: FloatArray) -> Placement:
         """Return the places of all bodies and joints at joint values (n, j)."""
         n, j = q.shape
-        T = np.tile(np.eye(4), (n, j + 1, 1, 1))
-        moves = self._move_all(q)
-        for i, carrier in enumerate(self._carriers):
-            T[:, i + 1] = T[:, carrier] @ moves[:, i] @ self._back[i]
-        frames = T[:, self._carriers] @ self._frames
-        axes = (frames[..., :3, :3] @ self._axes[:, :, None])[..., 0]
-        points = frames[..., :3, 3]
+        T, axes, points = (
+            np.tile(np.eye(4), (n, j + 1, 1, 1)),
+            np.zeros((n, j, 3)),
+            np.zeros((n, j, 3)),
+        )
+        for i, joint in enumerate(self.tree):
+            carrier = T[:, self._index[joint.body_a]]
+            frame = carrier @ joint.T_a
+            axes[:, i], points[:, i] = frame[:, :3, :3] @ joint.axis, frame[:, :3, 3]
+            T[:, i + 1] = carrier @ joint.move(q[:, i]) @ geometry.invert_pose(joint.T_b)
         return Placement(T, axes, points)
-
-    def _move_all(self, q: FloatArray) -> FloatArray:
-        """Return the frames (n, j, 4, 4) of the second bodies of the joints in the first ones."""
-        vectors = q[..., None] * self._axes
-        turns = np.where(self.turns[:, None], vectors, 0.0)
-        shifts = np.where(self.turns[:, None], 0.0, vectors)
-        return self._frames @ geometry.make_pose(geometry.exp_so3(turns), shifts)
 
     def get_place(self, placement: Placement, body: str) -> FloatArray:
         """Return the places (n, 4, 4) of a body."""
         return placement.T[:, self._index[body]]
+
+    def locate(self, q: FloatArray, body: str) -> FloatArray:
+        """Return the place (4, 4) of a body at joint values (j,)."""
+        return self.get_place(self.place(q[None]), body)[0]
 
     def locate_ends(self, placement: Placement, joint: GraphJoint) -> tuple[FloatArray, FloatArray]:
         """Return the frames (n, 4, 4) of a joint on both of its bodies, in the base."""
@@ -183,18 +163,20 @@ class JointGraph:
             self.get_place(placement, joint.body_b) @ joint.T_b,
         )
 
-    def differentiate(
-        self, placement: Placement, body: str, point: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return turn and velocity (n, 3, j) of a point (n, 3) [m] of a body by joint values."""
-        below = self._is_below[self._index[body]][:, None]
-        turns = self.turns[:, None]
+    def relate(self, placement: Placement, joint: GraphJoint) -> FloatArray:
+        """Return the frame (4, 4) of a joint on its second body in that on its first one."""
+        A, B = self.locate_ends(placement, joint)
+        return (geometry.invert_pose(A) @ B)[0]
+
+    def differentiate(self, placement: Placement, body: str, point: FloatArray) -> FloatArray:
+        """Return the twist (n, 6, j) (rotation, velocity) at a point (n, 3) [m] of a body by joint
+        values, in base axes.
+        """
         arms = np.cross(placement.axes, point[:, None] - placement.points)
-        velocity = np.where(turns, arms, placement.axes) * below
-        return (
-            np.where(turns & below, placement.axes, 0.0).swapaxes(-1, -2),
-            velocity.swapaxes(-1, -2),
-        )
+        turns = self.turns[:, None]
+        parts = np.where(turns, placement.axes, 0.0), np.where(turns, arms, placement.axes)
+        twists = np.concatenate(parts, axis=2) * self._is_below[self._index[body]][:, None]
+        return twists.swapaxes(1, 2)
 
     def linearize(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return residuals (n, e) of the closures at joint values (n, j), and derivatives by them.
@@ -216,26 +198,25 @@ class JointGraph:
     ) -> tuple[FloatArray, FloatArray]:
         """Return residuals and derivatives of one closure."""
         P, Q = self.locate_ends(placement, joint)
-        p, q = P[:, :3, 3], Q[:, :3, 3]
-        turn_p, speed_p = self.differentiate(placement, joint.body_a, p)
-        turn_q, speed_q = self.differentiate(placement, joint.body_b, q)
-        gap, gap_rows = (p - q) / self.size, (speed_p - speed_q) / self.size
-        if joint.kind == "S":
-            return gap, gap_rows
-        # directions that the joint keeps equal on both bodies
-        kept = [joint.axis] if joint.kind == "R" else list(np.eye(3))
-        u = [P[:, :3, :3] @ v for v in kept]
-        w = [Q[:, :3, :3] @ v for v in kept]
-        apart = np.concatenate([a - b for a, b in zip(u, w, strict=True)], axis=1)
-        turned = [
-            geometry.hat(b) @ turn_q - geometry.hat(a) @ turn_p for a, b in zip(u, w, strict=True)
-        ]
+        by_p, by_q = (
+            self.differentiate(placement, body, T[:, :3, 3])
+            for body, T in zip(joint.bodies, (P, Q), strict=True)
+        )
+        gap = (P[:, :3, 3] - Q[:, :3, 3]) / self.size
+        rows = (by_p[:, 3:] - by_q[:, 3:]) / self.size
         if joint.kind == "P":
-            axis = P[:, :3, :3] @ joint.axis
             # d (axis x gap) = axis x d gap - gap x (turn x axis)
-            swing = geometry.hat(gap) @ geometry.hat(axis) @ turn_p
-            gap, gap_rows = np.cross(axis, gap), geometry.hat(axis) @ gap_rows + swing
-        return (np.concatenate([gap, apart], axis=1), np.concatenate([gap_rows, *turned], axis=1))
+            axis = P[:, :3, :3] @ joint.axis
+            swing = geometry.hat(gap) @ geometry.hat(axis) @ by_p[:, :3]
+            gap, rows = np.cross(axis, gap), geometry.hat(axis) @ rows + swing
+        parts = [(gap, rows)]
+        # directions that the joint keeps equal on both bodies
+        for kept in {"R": joint.axis[None], "P": np.eye(3), "S": ()}[joint.kind]:
+            u, w = P[:, :3, :3] @ kept, Q[:, :3, :3] @ kept
+            turned = geometry.hat(w) @ by_q[:, :3] - geometry.hat(u) @ by_p[:, :3]
+            parts.append((u - w, turned))
+        residual, jacobian = (np.concatenate(arrays, axis=1) for arrays in zip(*parts, strict=True))
+        return residual, jacobian
 
     def close(self, starts: FloatArray, fixed: BoolArray | None = None) -> FloatArray:
         """Close the loops by Newton's method from joint values (n, j); NaN where it diverges.
@@ -294,7 +275,7 @@ class JointGraph:
         """
         placement = self.place(q[None])
         point = (self.get_place(placement, body) @ frame)[:, :3, 3]
-        return np.concatenate(self.differentiate(placement, body, point), axis=1)[0]
+        return self.differentiate(placement, body, point)[0]
 
 
 # Poses at which the loops of a mechanism close, and which of them is a good home.
@@ -366,7 +347,7 @@ def find_freedoms(graph: JointGraph, q: FloatArray, platform: str) -> Freedoms:
     the rates.
     """
     passive, rates = ~graph.is_driven, graph.find_motions(q) / graph.units[:, None]
-    place = graph.get_place(graph.place(q[None]), platform)[0]
+    place = graph.locate(q, platform)
     twists = graph.find_twists(q, platform, np.eye(4)) * graph.units
     twists[3:] /= max(graph.size, float(np.linalg.norm(place[:3, 3])))
     outputs = np.concatenate([rates[graph.is_driven], twists @ rates])
@@ -400,8 +381,7 @@ def list_nearby(graph: JointGraph, home: FloatArray) -> FloatArray:
 
 def measure_rotation(graph: JointGraph, q: FloatArray, joint: GraphJoint) -> FloatArray:
     """Return the rotation (3, 3) of a joint that closes a loop, at joint values (j,)."""
-    A, B = graph.locate_ends(graph.place(q[None]), joint)
-    return A[0, :3, :3].T @ B[0, :3, :3]
+    return graph.relate(graph.place(q[None]), joint)[:3, :3]
 
 
 def get_value(graph: JointGraph, q: FloatArray, joint: GraphJoint) -> float:
@@ -409,10 +389,8 @@ def get_value(graph: JointGraph, q: FloatArray, joint: GraphJoint) -> float:
     for i, other in enumerate(graph.tree):
         if joint.name in (other.name, other.origin_a, other.origin_b):
             return float(q[i])
-    if joint.kind == "R":
-        return float(geometry.log_so3(measure_rotation(graph, q, joint)) @ joint.axis)
-    A, B = graph.locate_ends(graph.place(q[None]), joint)
-    return float((geometry.invert_pose(A) @ B)[0, :3, 3] @ joint.axis)
+    T = graph.relate(graph.place(q[None]), joint)
+    return float((geometry.log_so3(T[:3, :3]) if joint.kind == "R" else T[:3, 3]) @ joint.axis)
 
 
 def count_repeated_closures(graph: JointGraph, q: FloatArray) -> int:
@@ -432,15 +410,12 @@ def _list_limits(graph: JointGraph) -> tuple[FloatArray, FloatArray]:
 
 def measure_gap(graph: JointGraph, placement: Placement, joint: GraphJoint) -> tuple[float, float]:
     """Return the distance [m] and angle [rad] between both sides of a closing joint."""
-    A, B = (T[0] for T in graph.locate_ends(placement, joint))
-    gap = B[:3, 3] - A[:3, 3]
-    if joint.kind == "S":
-        return float(np.linalg.norm(gap)), 0.0
-    a, b = A[:3, :3] @ joint.axis, B[:3, :3] @ joint.axis
+    T, axis = graph.relate(placement, joint), joint.axis
+    gap, turned = T[:3, 3], T[:3, :3] @ axis
     if joint.kind == "P":
-        gap = gap - a * (a @ gap)
-    angle = float(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b))
-    return float(np.linalg.norm(gap)), angle
+        gap = gap - axis * (axis @ gap)
+    angle = float(np.arctan2(np.linalg.norm(np.cross(axis, turned)), axis @ turned))
+    return float(np.linalg.norm(gap)), 0.0 if joint.kind == "S" else angle
 
 
 def _describe_gap(graph: JointGraph, starts: FloatArray) -> object:

@@ -121,39 +121,6 @@ class GraphLimb:
         return GraphLimb(self.to, self.on, joints)
 
 
-@dataclass(frozen=True, eq=False)
-class LimbPaths:
-    """A mechanism as limbs.
-
-    graph : its base carries the limbs. home : joint values (j,). platform : its body. limbs : all
-        joints but those of dead ends. freedoms : of the bodies, in base axes. motions : what motors
-        and passive joints can do at home.
-    """
-
-    graph: JointGraph
-    home: FloatArray
-    platform: str
-    limbs: tuple[GraphLimb, ...]
-    freedoms: tuple[str, ...]
-    motions: Freedoms
-
-    @cached_property
-    def bodies(self) -> tuple[str, ...]:
-        """Return the bodies beside base and platform that limbs join."""
-        ends = dict.fromkeys(end for limb in self.limbs for end in (limb.on, limb.to))
-        return tuple(body for body in ends if body not in (self.graph.base, self.platform))
-
-    @cached_property
-    def used(self) -> JointGraph:
-        """Return the mechanism without dead ends."""
-        names = {joint.name for limb in self.limbs for joint in limb.joints}
-        return select_joints(self.graph, {j for j in self.graph.joints if j.name in names})
-
-    def locate(self, body: str) -> FloatArray:
-        """Return the place (4, 4) of a body at home."""
-        return self.graph.get_place(self.graph.place(self.home[None]), body)[0]
-
-
 def find_limbs(graph: JointGraph, platform: str) -> tuple[GraphLimb, ...]:
     """Return limbs between base, platform and all bodies with three or more joints, without dead
     ends; the limbs of the first motor first. A ball joint is at the end of its limb.
@@ -272,22 +239,35 @@ PARALLEL, ALONG = 1e-9, 1e-12
 
 @dataclass(frozen=True, eq=False)
 class ClosedStage:
-    """A stage with closed loops.
+    """A stage with closed loops, as limbs.
 
-    paths : its limbs, from a base frame of its own.
-    mount : (4, 4) that frame in the body that carries the stage [m]; turned where the normal of
+    graph : its base carries the limbs, with a frame of its own. home : joint values (j,).
+    platform : the body that carries what follows. limbs : all joints but those of dead ends.
+    freedoms : of the bodies, in base axes.
+    mount : (4, 4) the base frame in the body that carries the stage [m]; turned where the normal of
         the plane of the loops is not an axis of that body.
     frame : (4, 4) of its platform in the body that carries what follows [m].
     """
 
-    paths: LimbPaths
+    graph: JointGraph
+    home: FloatArray
+    platform: str
+    limbs: tuple[GraphLimb, ...]
+    freedoms: tuple[str, ...]
     mount: FloatArray
     frame: FloatArray
 
-    @property
-    def platform(self) -> str:
-        """Return the body that carries what follows."""
-        return self.paths.platform
+    @cached_property
+    def bodies(self) -> tuple[str, ...]:
+        """Return the bodies beside base and platform that limbs join."""
+        ends = dict.fromkeys(end for limb in self.limbs for end in (limb.on, limb.to))
+        return tuple(body for body in ends if body not in (self.graph.base, self.platform))
+
+    @cached_property
+    def used(self) -> JointGraph:
+        """Return the mechanism without dead ends."""
+        names = {joint.name for limb in self.limbs for joint in limb.joints}
+        return select_joints(self.graph, {j for j in self.graph.joints if j.name in names})
 
 
 @dataclass(frozen=True, eq=False)
@@ -331,7 +311,7 @@ class StagePaths:
     def freedoms(self) -> tuple[str, ...]:
         """Return the components of twist in which the platform moves, in base axes."""
         if len(self.stages) == 1 and isinstance(self.stages[0], ClosedStage):
-            return self.stages[0].paths.freedoms
+            return self.stages[0].freedoms
         return list_freedoms(self.graph, self.home, self.platform, self.stages[-1].frame)
 
 
@@ -380,10 +360,9 @@ def find_stage_paths(
             freedoms = list_freedoms(*own, frame, of_joints=True)
             limbs = find_limbs(block.graph, block.platform)
             limbs = _keep_shifts_in_plane(block.graph, values, limbs, freedoms)
-            closed = LimbPaths(*own, limbs, freedoms, find_freedoms(*own))
-            if closed.motions.mobility == 0:
+            if find_freedoms(*own).mobility == 0:
                 raise MechanismError(report_finding("files.no-motion", platform=block.platform))
-            stages.append(ClosedStage(closed, mount, _align_frame(closed, frame)))
+            stages.append(ClosedStage(*own, limbs, freedoms, mount, _align_frame(*own, frame)))
     names = {joint.name for joint in kept.joints}
     dangling = tuple(joint.name for joint in whole.joints if joint.name not in names)
     outside = tuple(name for name in whole.motors if name not in graph.motors)
@@ -471,13 +450,15 @@ def _turn_base(block: Block) -> tuple[Block, FloatArray]:
     return replace(block, graph=replace(graph, tree=tree, closing=closing)), mount
 
 
-def _align_frame(paths: LimbPaths, T_body_frame: FloatArray) -> FloatArray:
+def _align_frame(
+    graph: JointGraph, home: FloatArray, platform: str, T_body_frame: FloatArray
+) -> FloatArray:
     """Return a frame (4, 4) of the platform with only those angles at home that it can change: a
     robot file states no others.
     """
-    moving = list_freedoms(paths.graph, paths.home, paths.platform, T_body_frame)
+    moving = list_freedoms(graph, home, platform, T_body_frame)
     turns = [name in moving for name in AXES[:3]]
-    place = paths.locate(paths.platform)
+    place = graph.locate(home, platform)
     angles = geometry.matrix_to_euler((place @ T_body_frame)[:3, :3], "xyz")
     if not any(turns) or np.abs(angles[np.logical_not(turns)]).max(initial=0.0) < ALONG:
         return T_body_frame

@@ -47,7 +47,6 @@ from loopcal.mechanism.joint_graph.loops import (
 from loopcal.mechanism.joint_graph.paths import (
     ClosedStage,
     GraphLimb,
-    LimbPaths,
     SerialStage,
     StagePaths,
     find_stage_paths,
@@ -375,7 +374,7 @@ def _report_structure(mechanism: Linkage, paths: StagePaths, frame: str) -> Iter
         )
     if len(paths.stages) > 1:
         names = list_stage_names(mechanism, paths)
-        loops = (isinstance(s, ClosedStage) and s.paths.graph.closing for s in paths.stages)
+        loops = (isinstance(s, ClosedStage) and s.graph.closing for s in paths.stages)
         closed = tuple(name for name, is_loop in zip(names, loops, strict=True) if is_loop)
         yield report_finding("files.urdf-stages", count=len(names), stages=names, closed=closed)
     if graph.size > LARGE:
@@ -410,12 +409,12 @@ Content = dict[str, Any]
 
 
 def describe_limb(
-    paths: LimbPaths, limb: GraphLimb, bodies: Mapping[str, str], T_body_frame: FloatArray
+    paths: ClosedStage, limb: GraphLimb, bodies: Mapping[str, str]
 ) -> tuple[Content, list[Content]]:
     """Return one limb of the robot file, and the entries of `parameters:` that it needs.
 
-    `bodies` are the names of bodies in the robot file, `T_body_frame` (4, 4) is the frame of the
-    platform. The limb ends in a point where its last joint is a ball joint.
+    `bodies` are the names of bodies in the robot file. The limb ends in a point where its last
+    joint is a ball joint.
     """
     name, last = limb.joints[0].name, limb.joints[-1]
     on, to = (bodies[body] for body in (limb.on, limb.to))
@@ -449,7 +448,7 @@ def describe_limb(
             chain.append(_describe_limb_joint(paths, joint, place))
         pending, before = geometry.invert_pose(joint.T_b), joint
     attach: FloatArray = geometry.invert_pose(
-        pending @ (T_body_frame if to == PLATFORM else np.eye(4))
+        pending @ (paths.frame if to == PLATFORM else np.eye(4))
     )
     if last.origin_b:
         errors.append(_describe_shifts(to, last.origin_b, last.shifts))
@@ -491,7 +490,7 @@ def _describe_shifts(element: str, origin: str, axes: str) -> Content:
     return {"of": element, **name, "shift": list(axes)}
 
 
-def _describe_limb_joint(paths: LimbPaths, joint: GraphJoint, place: FloatArray) -> Content:
+def _describe_limb_joint(paths: ClosedStage, joint: GraphJoint, place: FloatArray) -> Content:
     """Return a joint of a limb."""
     content = {"joint": joint.kind, "name": joint.name, "at": describe_pose(place)}
     if joint.kind == "S":
@@ -503,13 +502,13 @@ def _describe_limb_joint(paths: LimbPaths, joint: GraphJoint, place: FloatArray)
     return {**content, "axis": _clear(joint.axis), "start": start, **motor}
 
 
-def _is_actuated(paths: LimbPaths, joint: GraphJoint) -> bool:
+def _is_actuated(paths: ClosedStage, joint: GraphJoint) -> bool:
     """Return whether a joint has the value of a driven one."""
     lead, *law = paths.used.find_lead(joint)
     return joint.drive in paths.used.motors and (joint.kind, *law) == (lead.kind, 1.0, 0.0)
 
 
-def _describe_couplings(paths: LimbPaths) -> Content:
+def _describe_couplings(paths: ClosedStage) -> Content:
     """Return the couplings of joints, each named after the one that follows."""
     graph = paths.used
     moved = [(limb.joints[0].name, joint) for limb in paths.limbs for joint in limb.joints]
@@ -607,27 +606,27 @@ def _choose_coordinates(
     graph: JointGraph, q: FloatArray, platform: str, T_body_frame: FloatArray
 ) -> list[str]:
     """Return the coordinates in which a frame of the platform is commanded."""
-    home = graph.get_place(graph.place(q[None]), platform)[0] @ T_body_frame
+    home = graph.locate(q, platform) @ T_body_frame
     motions = graph.find_twists(q, platform, T_body_frame) @ graph.find_motions(q)
     return list(choose_coordinates(home, motions))
 
 
-def _describe_limbs(mechanism: Linkage, stage: ClosedStage) -> Content:
+def _describe_limbs(mechanism: Linkage, paths: ClosedStage) -> Content:
     """Return the keys of the family limbs."""
-    paths, T_body_frame = stage.paths, stage.frame
-    graph, joints = paths.graph, mechanism.tree.joints
+    graph, home, joints = paths.graph, paths.home, mechanism.tree.joints
     links = (choose_link(mechanism, body) for body in paths.bodies)
     inner = _make_unique(links, (BASE, PLATFORM))
     bodies = dict(zip(paths.bodies, inner, strict=True))
     homes = [
-        {"name": name, "home": describe_pose(paths.locate(body))} for body, name in bodies.items()
+        {"name": name, "home": describe_pose(graph.locate(home, body))}
+        for body, name in bodies.items()
     ]
     bodies |= {graph.base: BASE, paths.platform: PLATFORM}
-    limbs = [describe_limb(paths, limb, bodies, T_body_frame) for limb in paths.limbs]
+    limbs = [describe_limb(paths, limb, bodies) for limb in paths.limbs]
     parameters = [entry for _, entries in limbs for entry in entries]
     return {
         "freedoms": list(paths.freedoms),
-        "controlled": _choose_coordinates(graph, paths.home, paths.platform, T_body_frame),
+        "controlled": _choose_coordinates(graph, home, paths.platform, paths.frame),
         "actuators": {
             name: _describe_drive(mechanism.tree, joints[name], paths.used.leads[name])
             for name in paths.used.motors
@@ -636,7 +635,7 @@ def _describe_limbs(mechanism: Linkage, stage: ClosedStage) -> Content:
         **({"bodies": homes} if homes else {}),
         "limbs": [limb for limb, _ in limbs],
         **({"parameters": parameters} if parameters else {}),
-        "home": describe_pose(paths.locate(paths.platform) @ T_body_frame),
+        "home": describe_pose(graph.locate(home, paths.platform) @ paths.frame),
     }
 
 
