@@ -21,7 +21,6 @@ from loopcal.mechanism.limb_rows import (
     select_block,
     stack_closure_rows,
     stack_displacement_columns,
-    stack_driven_columns,
 )
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.states import driven_values
@@ -222,10 +221,9 @@ def stack_sum_rows(
     program: Program, blocks: engine.ClosureBlocks, weights: FloatArray
 ) -> FloatArray:
     """Return closure rows, then sums (t, n, c + r, M + J), by freedoms and driven joints."""
-    A, Q = stack_closure_rows(blocks), stack_driven_columns(program, blocks)
-    own = np.broadcast_to(weights[:, None], (*A.shape[:2], *weights.shape[1:]))
-    none = np.zeros((*own.shape[:3], A.shape[3]))
-    top, low = np.concatenate([A, Q], axis=3), np.concatenate([none, own], axis=3)
+    top = stack_closure_rows(program, blocks)
+    low = np.zeros((*top.shape[:2], weights.shape[1], top.shape[3]))
+    low[..., len(program.unknown_twists) :] = weights[:, None]
     return np.concatenate([top, low], axis=2)
 
 

@@ -7,7 +7,7 @@ A limb's rows are A y + E de + Q dq = 0 and, for its eliminated joints, U dtheta
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -167,11 +167,28 @@ def move_passive_joints(
     return out
 
 
-def stack_closure_rows(blocks: engine.ClosureBlocks) -> FloatArray:
-    """Return all closure rows against the freedoms of all nodes, (t, n, c, M)."""
-    return np.concatenate(
-        [b.A.reshape(*b.A.shape[:2], -1, b.A.shape[-1]) for b in blocks.closure], axis=2
-    )
+def stack_closure_rows(program: Program, blocks: engine.ClosureBlocks) -> FloatArray:
+    """Return all closure rows (t, n, c, M + J) against the freedoms of all nodes, then the driven
+    joints.
+    """
+    M, rows = len(program.unknown_twists), []
+    for own in divide_limbs(program, blocks):
+        whole = np.zeros((*own.A.shape[:3], M + program.n_joints))
+        whole[..., :M], whole[..., M + own.drives] = own.A, own.Q
+        rows.append(whole)
+    return np.concatenate(rows, axis=2)
+
+
+def stack_displacement_columns(
+    program: Program, blocks: engine.ClosureBlocks, *, passive: bool = False
+) -> FloatArray:
+    """Return all closure rows, or those of passive joints, against displacements (t, n, c, d)."""
+    rows = []
+    for own in divide_limbs(program, blocks, passive=passive):
+        whole = np.zeros((*own.E.shape[:3], program.n_displacements))
+        whole[..., own.slots] = own.E
+        rows.append(whole)
+    return np.concatenate(rows, axis=2)
 
 
 def reduce_to_platform(
@@ -180,39 +197,17 @@ def reduce_to_platform(
     """Return the closure rows that contain no twist of other nodes than the platform, against its
     freedoms (t, n, c, m) and the actuated joints (t, n, c, a), by an orthogonal reduction.
     """
-    A, Q = stack_closure_rows(blocks), stack_driven_columns(program, blocks)
-    if not program.others:
-        return A, Q
-    m, eliminated = len(program.freedoms), A.shape[-1] - len(program.freedoms)
-    whole = np.concatenate([A[..., m:], A[..., :m], Q], axis=-1)
-    rows = np.asarray(np.linalg.qr(whole, mode="r"))[..., eliminated:, eliminated:]
-    out = np.zeros((*A.shape[:2], A.shape[2] - eliminated, rows.shape[-1]))
-    out[:, :, : rows.shape[2]] = rows
-    return out[..., :m], out[..., m:]
-
-
-def stack_driven_columns(program: Program, blocks: engine.ClosureBlocks) -> FloatArray:
-    """Return all closure rows against the actuated joints, (t, n, c, a)."""
-    parts = ((limb.Q, limb.drives) for limb in divide_limbs(program, blocks))
-    return _stack_columns(parts, program.n_joints)
-
-
-def stack_displacement_columns(
-    program: Program, blocks: engine.ClosureBlocks, *, passive: bool = False
-) -> FloatArray:
-    """Return all closure rows, or those of passive joints, against displacements (t, n, c, d)."""
-    parts = ((limb.E, limb.slots) for limb in divide_limbs(program, blocks, passive=passive))
-    return _stack_columns(parts, program.n_displacements)
-
-
-def _stack_columns(parts: Iterable[tuple[FloatArray, IntArray | slice]], width: int) -> FloatArray:
-    """Return the rows of limbs (t, n, r, ..) at their columns in a matrix (t, n, c, width)."""
-    rows = []
-    for part, columns in parts:
-        whole = np.zeros((*part.shape[:3], width))
-        whole[..., columns] = part
-        rows.append(whole)
-    return np.concatenate(rows, axis=2)
+    rows, m, M = (
+        stack_closure_rows(program, blocks),
+        len(program.freedoms),
+        len(program.unknown_twists),
+    )
+    if eliminated := M - m:
+        whole = np.concatenate([rows[..., m:M], rows[..., :m], rows[..., M:]], axis=-1)
+        short = np.asarray(np.linalg.qr(whole, mode="r"))[..., eliminated:, eliminated:]
+        rows = np.zeros((*rows.shape[:2], rows.shape[2] - eliminated, short.shape[-1]))
+        rows[:, :, : short.shape[2]] = short
+    return rows[..., :m], rows[..., m:]
 
 
 # Frames along a limb for displacements and joint values, and the length of its rod.

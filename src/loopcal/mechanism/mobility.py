@@ -27,12 +27,7 @@ from loopcal.mechanism.assembly import (
     refuse_more,
     select_rows,
 )
-from loopcal.mechanism.limb_rows import (
-    linearize_state,
-    reduce_to_platform,
-    stack_closure_rows,
-    stack_driven_columns,
-)
+from loopcal.mechanism.limb_rows import linearize_state, reduce_to_platform, stack_closure_rows
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import (
     COORDINATES,
@@ -135,9 +130,9 @@ def refuse_free_bodies(robot: Mechanism, state: engine.State) -> None:
     if not robot.program.others:
         return
     m, columns = len(robot.program.freedoms), robot.program.unknown_twists
-    rows = stack_closure_rows(linearize_state(robot, state))[0, 0]
+    rows = stack_closure_rows(robot.program, linearize_state(robot, state))[0, 0]
     scale = [1 / robot.twist_scale[f] for _, f in columns[m:]]
-    _, s, V = np.linalg.svd(rows[:, m:] * scale, full_matrices=True)
+    _, s, V = np.linalg.svd(rows[:, m : len(columns)] * scale, full_matrices=True)
     if (rank := count_rank(s)) < len(scale):
         node, _ = columns[m + int(np.abs(V[rank]).argmax())]
         own = [i for i, (other, _) in enumerate(columns[m:]) if other == node]
@@ -190,8 +185,9 @@ def refuse_singular_home(robot: Mechanism, state: engine.State) -> None:
     """
     if not state.residual[0, 0] < CLOSED * robot.size:
         return
-    columns = stack_driven_columns(robot.program, linearize_state(robot, state))
-    motion = np.linalg.norm(columns[0, 0], axis=0)
+    program = robot.program
+    rows = stack_closure_rows(program, linearize_state(robot, state))[0, 0]
+    motion = np.linalg.norm(rows[:, len(program.unknown_twists) :], axis=0)
     names = robot.assembly.driven_joints
     is_idle = motion < STRETCHED * robot.joint_units
     finding = report_finding(

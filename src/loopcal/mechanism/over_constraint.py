@@ -29,7 +29,6 @@ from loopcal.mechanism.limb_rows import (
     linearize_state,
     stack_closure_rows,
     stack_displacement_columns,
-    stack_driven_columns,
 )
 from loopcal.mechanism.mobility import RANK, check_assembly, count_rank
 from loopcal.mechanism.model import Mechanism
@@ -53,13 +52,13 @@ share of the robot's size, or this many radians. Home alone may be a special pos
 class _Rows(NamedTuple):
     """The closure equations at one pose with the passive joints eliminated.
 
-    A : (c, M) by the freedoms of all nodes, rotations over the robot's size. Q : (c, a) by driven
-    joints. E : (c, d) by displacements. limb : (c,) the limb of each equation. absorbed : (j, d) by
-    displacements, the equations that determine the j passive joints.
+    A : (c, M) by the freedoms of all nodes, rotations over the robot's size. both : (c, M + J) by
+    these, then driven joints. E : (c, d) by displacements. limb : (c,) the limb of each equation.
+    absorbed : (j, d) by displacements, the equations that determine the j passive joints.
     """
 
     A: FloatArray
-    Q: FloatArray
+    both: FloatArray
     E: FloatArray
     limb: IntArray
     absorbed: FloatArray
@@ -69,16 +68,15 @@ class _Rows(NamedTuple):
         so many first ones.
         """
         own = self.limb < (self.limb.max() + 1 if limbs is None else limbs)
-        both = np.concatenate([self.A, self.Q], axis=1)[own]
-        left, s, _ = np.linalg.svd(both, full_matrices=True)
-        out = np.zeros((len(both) - count_rank(s), len(own)))
-        out[:, own] = left[:, len(both) - len(out) :].T
+        left, s, _ = np.linalg.svd(self.both[own], full_matrices=True)
+        out = np.zeros((len(left) - count_rank(s), len(own)))
+        out[:, own] = left[:, len(left) - len(out) :].T
         return out
 
     def constrain(self, limb: int) -> FloatArray:
         """Return an orthonormal basis (r, M) of what a limb constrains with its drives free."""
         own = self.limb == limb
-        left, s, _ = np.linalg.svd(self.Q[own], full_matrices=True)
+        left, s, _ = np.linalg.svd(self.both[own, self.A.shape[1] :], full_matrices=True)
         undriven = left[:, count_rank(s) :]
         return _find_basis(undriven.T @ self.A[own])
 
@@ -92,14 +90,15 @@ def _find_basis(vectors: FloatArray) -> FloatArray:
 def _linearize(robot: Mechanism, state: State) -> list[_Rows]:
     """Return the equations at the poses of a state (1, n), at the nominal values."""
     program, blocks = robot.program, linearize_state(robot, state, robot.parameters.nominal[None])
-    scale = 1 / robot.twist_scale[[f for _, f in program.unknown_twists]]
-    A, Q = stack_closure_rows(blocks)[0] * scale, stack_driven_columns(program, blocks)[0]
+    scale = robot.twist_scale[[f for _, f in program.unknown_twists]]
+    both, M = stack_closure_rows(program, blocks)[0], len(scale)
+    both[..., :M] /= scale
     E, absorbed = (
         stack_displacement_columns(program, blocks, passive=passive)[0] for passive in (False, True)
     )
     counts = [(own.limb, own.A.shape[2]) for own in divide_limbs(program, blocks)]
     limb = np.repeat(*np.transpose(counts))
-    return [_Rows(A[i], Q[i], E[i], limb, absorbed[i]) for i in range(state.T.shape[1])]
+    return [_Rows(own[:, :M], own, E[i], limb, absorbed[i]) for i, own in enumerate(both)]
 
 
 def report_over_constraint(
@@ -224,7 +223,7 @@ def _find_sufficient_freedoms(
     freedoms = robot.program.freedoms
     used, columns = set[int](), np.array([f for _, f in robot.program.unknown_twists])
     for rows in _linearize(robot, find_nearby_states(robot)):
-        _, s, W = np.linalg.svd(np.concatenate([rows.A, rows.Q], axis=1), full_matrices=True)
+        _, s, W = np.linalg.svd(rows.both, full_matrices=True)
         largest = np.abs(W[count_rank(s) :, : rows.A.shape[1]]).max(axis=0, initial=0.0)
         used.update(columns[largest > SAME * largest.max(initial=1e-300)].tolist())
     still = [i for i, f in enumerate(freedoms) if f not in used]
