@@ -51,7 +51,7 @@ from loopcal.measure.observations import Observations, StatedSize, find_size
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.solutions import Solution
 from loopcal.mechanism.workspace import sample_workspace
-from loopcal.numerics.decomposition import are_nonzero, substitute_backward
+from loopcal.numerics.decomposition import are_nonzero, find_null_space, substitute_backward
 from loopcal.numerics.elimination import TreeElimination
 from loopcal.numerics.statistics import find_distinct
 from loopcal.results.description import OTHER, Field, fields, label_axes
@@ -446,8 +446,7 @@ def _separate_setup(
     conditions = np.block([[np.eye(p) + inner[:, : len(rows)] @ rows, -F.T]])
     absent = np.concatenate(N)
     absent = np.concatenate([absent, np.zeros((len(absent), F.shape[0]))], axis=1)
-    _, s, vt = np.linalg.svd(np.concatenate([conditions, absent]))
-    null = vt[int(are_nonzero(s).sum()) :].T
+    null = find_null_space(np.concatenate([conditions, absent]))
     free = np.linalg.qr(np.concatenate([-rows @ null[:p], null[p:]]))[0]
     along = inner @ free
     separated, first = list(errors), np.cumsum([0, *(len(each) for each in H)])

@@ -639,7 +639,7 @@ def _check_drives_of_pose(robot: Mechanism) -> None:
     q = compute_readings(robot, values, home)
     D = differentiate_pose(robot, values, q, home).readings[0, 0][:, moving]
     scaled = D * robot.twist_scale[:, None] / robot.drive_units[moving]
-    freedoms = count_rank(np.linalg.svd(scaled, compute_uv=False))
+    freedoms = count_rank(scaled)
     c, a = len(robot.controlled), len(moving)
     if not freedoms <= c <= a:
         raise MechanismError(
@@ -654,7 +654,7 @@ def _check_drives_of_pose(robot: Mechanism) -> None:
     target = read_coordinates(home.T[0], robot.controlled)
     _, slope = compare_coordinates(home.T[0], target, robot.controlled, robot.size)
     rates = slope[0] / robot.twist_scale @ scaled
-    independent = count_rank(np.linalg.svd(rates, compute_uv=False))
+    independent = count_rank(rates)
     if independent < c:
         finding = report_finding(
             "mechanism.chain-singular-home",

@@ -179,6 +179,14 @@ def stack_closure_rows(program: Program, blocks: engine.ClosureBlocks) -> FloatA
     return np.concatenate(rows, axis=2)
 
 
+def stack_scaled_rows(robot: Mechanism, blocks: engine.ClosureBlocks) -> FloatArray:
+    """Return `stack_closure_rows`, where rotations are lengths at the robot's size."""
+    rows = stack_closure_rows(robot.program, blocks)
+    twists = [f for _, f in robot.program.unknown_twists]
+    rows[..., : len(twists)] /= robot.twist_scale[twists]
+    return rows
+
+
 def stack_displacement_columns(
     program: Program, blocks: engine.ClosureBlocks, *, passive: bool = False
 ) -> FloatArray:

@@ -5,16 +5,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from loopcal import engine
 from loopcal.engine import ENDINGS
 from loopcal.errors import MechanismError
 from loopcal.findings import report_finding
-from loopcal.mechanism.actuation import list_open_sums, measure_sums, stack_sum_rows
+from loopcal.mechanism.actuation import list_open_sums, measure_sums
 from loopcal.mechanism.assembly import (
     AXES,
     MOST_ACTUATORS,
@@ -27,7 +25,7 @@ from loopcal.mechanism.assembly import (
     refuse_more,
     select_rows,
 )
-from loopcal.mechanism.limb_rows import linearize_state, reduce_to_platform, stack_closure_rows
+from loopcal.mechanism.limb_rows import linearize_state, reduce_to_platform, stack_scaled_rows
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import (
     COORDINATES,
@@ -37,7 +35,7 @@ from loopcal.mechanism.platform_coordinates import (
 )
 from loopcal.mechanism.states import driven_values
 from loopcal.mechanism.transmission import select_weights
-from loopcal.numerics.decomposition import are_nonzero
+from loopcal.numerics.decomposition import find_null_space
 from loopcal.typing import FloatArray
 from loopcal.units import SI_SYMBOLS, Dimension
 
@@ -60,7 +58,6 @@ def check_mobility(robot: Mechanism) -> Mechanism:
     """
     program, home = robot.program, robot.home_state
     blocks = linearize_state(robot, home)
-    scale = 1 / robot.twist_scale[list(program.freedoms)]
     lost = [
         robot.assembly.limbs[limb].name
         for group, block in zip(program.groups, blocks.closure, strict=True)
@@ -70,42 +67,38 @@ def check_mobility(robot: Mechanism) -> Mechanism:
     if lost:
         raise MechanismError(report_finding("mechanism.no-direction", name=robot.name, limbs=lost))
     refuse_free_bodies(robot, home)
-    A, Q = (rows[0, 0] for rows in reduce_to_platform(program, blocks))
-    A = A * scale
-    names = [AXES[f] for f in program.freedoms]
-    _, s, V = np.linalg.svd(A, full_matrices=True)
-    m, a = len(names), program.n_joints
-    rank = count_rank(s)
-    if rank < m:
+    closure, names = stack_scaled_rows(robot, blocks)[0, 0], [AXES[f] for f in program.freedoms]
+    m, a, M = len(names), program.n_joints, len(program.unknown_twists)
+    free = find_null_space(closure[:, :M], RANK)
+    if free.size:
         finding = report_finding(
             "mechanism.free-platform",
             name=robot.name,
-            motion=tuple(list_main_freedoms(names, V[rank])),
-            equations=len(A),
-            rank=rank,
+            motion=tuple(list_main_freedoms(names, free[:m, 0])),
+            equations=len(closure) - (M - m),
+            rank=m - free.shape[1],
             freedoms=m,
         )
         raise MechanismError(finding)
-    rows = np.concatenate([A, Q], axis=1)
+    rows = closure
     if robot.assembly.couplings:
         sums = list_open_sums(robot, robot.values[None])
         a, coupled = sums.chosen, sums.weights[:, sums.chosen :]
         coupled = coupled[0] * measure_sums(robot, coupled)[:, None]
-        rows = np.concatenate([rows, np.pad(coupled, [(0, 0), (m, 0)])])
-    _, both, W = np.linalg.svd(rows, full_matrices=True)
-    # motions with every actuator free: solutions (y, dq) of A y + Q dq = 0, A of full column rank
-    independent = count_rank(both)
-    motions = W[independent:, :m]
-    movable = len(motions)
+        rows = np.concatenate([closure, np.pad(coupled, [(0, 0), (M, 0)])])
+    # motions of the platform with every actuator free
+    motions = find_null_space(rows, RANK)[:m]
+    movable = motions.shape[1]
     if movable < min(a, m):
-        fixed = np.linalg.svd(motions, full_matrices=True)[2][movable:] if movable else np.eye(m)
         finding = report_finding(
             "mechanism.over-constrained",
             name=robot.name,
             actuators=a,
             movable=movable,
             freedoms=m,
-            motions=tuple(tuple(list_main_freedoms(names, y)) for y in fixed),
+            motions=tuple(
+                tuple(list_main_freedoms(names, y)) for y in find_null_space(motions.T, RANK).T
+            ),
         )
         raise MechanismError(finding)
     if len(robot.controlled) != movable:
@@ -114,58 +107,48 @@ def check_mobility(robot: Mechanism) -> Mechanism:
             f"{len(robot.controlled)} controlled coordinates ({', '.join(robot.controlled)}). Name "
             f"{movable}"
         )
-    # freedoms per actuated joint (m, a), or motion, and the controlled coordinates by them
-    D = scale[:, None] * np.linalg.lstsq(A, -Q, rcond=None)[0]
-    if robot.assembly.couplings:
-        D = scale[:, None] * motions.T
-    rates = np.linalg.svd(_differentiate_controlled(robot, robot.home) @ D, compute_uv=False)
-    if count_rank(rates) < movable:
+    twists = motions / robot.twist_scale[list(program.freedoms), None]
+    if count_rank(_differentiate_controlled(robot, robot.home) @ twists) < movable:
         raise MechanismError(_word_dependent(robot, movable))
-    is_redundant = robot.has_open_sums and _check_open_sums(robot, blocks)
+    is_redundant = robot.has_open_sums and _check_open_sums(robot, closure)
     return replace(robot, program=replace(program, may_stay_open=True)) if is_redundant else robot
 
 
 def refuse_free_bodies(robot: Mechanism, state: engine.State) -> None:
     """Refuse bodies that can move while platform and actuators rest, at a state (1, 1)."""
-    if not robot.program.others:
-        return
     m, columns = len(robot.program.freedoms), robot.program.unknown_twists
-    rows = stack_closure_rows(robot.program, linearize_state(robot, state))[0, 0]
-    scale = [1 / robot.twist_scale[f] for _, f in columns[m:]]
-    _, s, V = np.linalg.svd(rows[:, m : len(columns)] * scale, full_matrices=True)
-    if (rank := count_rank(s)) < len(scale):
-        node, _ = columns[m + int(np.abs(V[rank]).argmax())]
+    rows = stack_scaled_rows(robot, linearize_state(robot, state))[0, 0]
+    free = find_null_space(rows[:, m : len(columns)], RANK)
+    if free.size:
+        motion = free[:, 0]
+        node, _ = columns[m + int(np.abs(motion).argmax())]
         own = [i for i, (other, _) in enumerate(columns[m:]) if other == node]
         names = [AXES[columns[m + i][1]] for i in own]
         finding = report_finding(
             "mechanism.free-body",
             name=robot.name,
             body=tuple(robot.assembly.bodies)[node - 1],
-            motion=tuple(list_main_freedoms(names, V[rank][own])),
+            motion=tuple(list_main_freedoms(names, motion[own])),
         )
         raise MechanismError(finding)
 
 
-def _check_open_sums(robot: Mechanism, blocks: engine.ClosureBlocks) -> bool:
+def _check_open_sums(robot: Mechanism, rows: FloatArray) -> bool:
     """Return whether the sums are more than the freedoms at home, where they contradict each other
-    by their errors. Refuse sums that leave the platform free, and too many couplings.
+    by their errors, for closure rows (c, M + J). Refuse sums that leave the platform free.
     """
-    program, (_, tau) = robot.program, robot.slots(robot.values[None])
+    _, tau = robot.slots(robot.values[None])
     weights = select_weights(tau, robot.slots.constants)
     assert weights is not None
-    rows = stack_sum_rows(program, blocks, weights * measure_sums(robot, weights)[:, None])[0, 0]
-    scale = [1 / robot.twist_scale[f] for _, f in program.unknown_twists]
-    rows[:, : len(scale)] *= scale
-    closure = len(rows) - weights.shape[1]
-    unknown, sums = rows.shape[1], len(robot.assembly.rows)
-    if count_rank(np.linalg.svd(rows, compute_uv=False)) < unknown:
+    units = measure_sums(robot, weights)[:, None]
+    sums = np.pad(weights[0] * units, [(0, 0), (rows.shape[1] - weights.shape[2], 0)])
+    if count_rank(np.concatenate([rows, sums])) < rows.shape[1]:
         raise MechanismError(
             f"{robot.name}: the sums of its readings and couplings do not hold the platform "
             f"at home: it can move while all sums are constant. Correct the weights of "
             f"`sum:`, or give another `home:`"
         )
-    free = unknown - count_rank(np.linalg.svd(rows[:closure], compute_uv=False))
-    return sums > free
+    return len(robot.assembly.rows) > rows.shape[1] - count_rank(rows)
 
 
 def refuse_uncontrolled(robot: Mechanism, state: engine.State) -> None:
@@ -174,8 +157,7 @@ def refuse_uncontrolled(robot: Mechanism, state: engine.State) -> None:
     rows = reduce_to_platform(robot.program, blocks)[0][0, 0]
     columns = _differentiate_controlled(robot, state.T[0, 0])
     scale = 1 / robot.twist_scale[list(robot.program.freedoms)]
-    s = np.linalg.svd(np.concatenate([rows, columns]) * scale, compute_uv=False)
-    if count_rank(s) < len(scale):
+    if count_rank(np.concatenate([rows, columns]) * scale) < len(scale):
         raise MechanismError(_word_dependent(robot, len(robot.controlled)))
 
 
@@ -185,9 +167,8 @@ def refuse_singular_home(robot: Mechanism, state: engine.State) -> None:
     """
     if not state.residual[0, 0] < CLOSED * robot.size:
         return
-    program = robot.program
-    rows = stack_closure_rows(program, linearize_state(robot, state))[0, 0]
-    motion = np.linalg.norm(rows[:, len(program.unknown_twists) :], axis=0)
+    rows = stack_scaled_rows(robot, linearize_state(robot, state))[0, 0]
+    motion = np.linalg.norm(rows[:, len(robot.program.unknown_twists) :], axis=0)
     names = robot.assembly.driven_joints
     is_idle = motion < STRETCHED * robot.joint_units
     finding = report_finding(
@@ -246,17 +227,17 @@ def _find_dependent_columns(U: FloatArray) -> list[int]:
     chosen: list[int] = []
     while True:
         rest = [c for c in range(U.shape[1]) if c not in chosen]
-        _, s, V = np.linalg.svd(U[:, rest])
-        if count_rank(s) == len(rest):
+        null = find_null_space(U[:, rest], RANK)
+        if not null.size:
             return chosen
-        part = np.abs(V[-1])
+        part = np.abs(null[:, -1])
         # of equal components the first, whatever their rounding errors
         chosen.append(rest[int(np.argmax(part > (1 - 1e-6) * part.max()))])
 
 
-def count_rank(s: NDArray[np.floating[Any]]) -> int:
+def count_rank(rows: FloatArray) -> int:
     """Return how many singular values of closure equations are above RANK times the largest."""
-    return int(are_nonzero(s, RANK).sum())
+    return rows.shape[1] - find_null_space(rows, RANK).shape[1]
 
 
 def list_main_freedoms(names: Sequence[str], direction: FloatArray) -> list[str]:

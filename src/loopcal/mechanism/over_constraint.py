@@ -27,12 +27,13 @@ from loopcal.mechanism.kinematics import compute_readings, forward_trials
 from loopcal.mechanism.limb_rows import (
     divide_limbs,
     linearize_state,
-    stack_closure_rows,
     stack_displacement_columns,
+    stack_scaled_rows,
 )
-from loopcal.mechanism.mobility import RANK, check_assembly, count_rank
+from loopcal.mechanism.mobility import RANK, check_assembly
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.states import Status, join_states, select_poses
+from loopcal.numerics.decomposition import find_null_space
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
 # Largest component, relative to the whole, by which a vector may differ from a named direction, or
@@ -68,16 +69,15 @@ class _Rows(NamedTuple):
         so many first ones.
         """
         own = self.limb < (self.limb.max() + 1 if limbs is None else limbs)
-        left, s, _ = np.linalg.svd(self.both[own], full_matrices=True)
-        out = np.zeros((len(left) - count_rank(s), len(own)))
-        out[:, own] = left[:, len(left) - len(out) :].T
+        repeated = find_null_space(self.both[own].T, RANK)
+        out = np.zeros((repeated.shape[1], len(own)))
+        out[:, own] = repeated.T
         return out
 
     def constrain(self, limb: int) -> FloatArray:
         """Return an orthonormal basis (r, M) of what a limb constrains with its drives free."""
         own = self.limb == limb
-        left, s, _ = np.linalg.svd(self.both[own, self.A.shape[1] :], full_matrices=True)
-        undriven = left[:, count_rank(s) :]
+        undriven = find_null_space(self.both[own, self.A.shape[1] :].T, RANK)
         return _find_basis(undriven.T @ self.A[own])
 
 
@@ -90,9 +90,7 @@ def _find_basis(vectors: FloatArray) -> FloatArray:
 def _linearize(robot: Mechanism, state: State) -> list[_Rows]:
     """Return the equations at the poses of a state (1, n), at the nominal values."""
     program, blocks = robot.program, linearize_state(robot, state, robot.parameters.nominal[None])
-    scale = robot.twist_scale[[f for _, f in program.unknown_twists]]
-    both, M = stack_closure_rows(program, blocks)[0], len(scale)
-    both[..., :M] /= scale
+    both, M = stack_scaled_rows(robot, blocks)[0], len(program.unknown_twists)
     E, absorbed = (
         stack_displacement_columns(program, blocks, passive=passive)[0] for passive in (False, True)
     )
@@ -223,8 +221,8 @@ def _find_sufficient_freedoms(
     freedoms = robot.program.freedoms
     used, columns = set[int](), np.array([f for _, f in robot.program.unknown_twists])
     for rows in _linearize(robot, find_nearby_states(robot)):
-        _, s, W = np.linalg.svd(rows.both, full_matrices=True)
-        largest = np.abs(W[count_rank(s) :, : rows.A.shape[1]]).max(axis=0, initial=0.0)
+        motions = find_null_space(rows.both, RANK)[: rows.A.shape[1]]
+        largest = np.abs(motions).max(axis=1, initial=0.0)
         used.update(columns[largest > SAME * largest.max(initial=1e-300)].tolist())
     still = [i for i, f in enumerate(freedoms) if f not in used]
     for left_out in range(1, len(still) + 1):

@@ -301,10 +301,10 @@ class Decomposition(TrialBatch):
 PARALLEL = 1e-2
 
 
-def find_null_space(rows: FloatArray) -> FloatArray:
+def find_null_space(rows: FloatArray, tolerance: float = RANK_TOLERANCE) -> FloatArray:
     """Return an orthonormal basis (p, k) of the vectors that rows (m, p) do not see."""
     _, s, vt = np.linalg.svd(rows, full_matrices=True)
-    return vt[int(are_nonzero(s).sum()) :].T
+    return vt[int(are_nonzero(s, tolerance).sum()) :].T
 
 
 def intersect_spaces(first: FloatArray, second: FloatArray, sine: float = PARALLEL) -> FloatArray:

@@ -21,7 +21,7 @@ from loopcal import geometry
 from loopcal.errors import MechanismError
 from loopcal.findings import Quantity, report_finding
 from loopcal.mechanism.joint_graph.graph import GraphJoint, turn_between
-from loopcal.numerics.decomposition import are_nonzero
+from loopcal.numerics.decomposition import find_null_space
 from loopcal.typing import BoolArray, FloatArray
 
 # Singular value of the scaled closures, relative to the largest, that counts as zero [1].
@@ -263,11 +263,7 @@ class JointGraph:
         Rates are orthonormal in the scaled values.
         """
         rows = self.linearize(q[None])[1][0]
-        if not len(rows):
-            return np.diag(self.units)
-        _, s, V = np.linalg.svd(rows)
-        null = V[int(are_nonzero(s, CLOSURE_RANK_TOLERANCE).sum()) :]
-        return self.units[:, None] * null.T
+        return self.units[:, None] * find_null_space(rows, CLOSURE_RANK_TOLERANCE)
 
     def find_twists(self, q: FloatArray, body: str, frame: FloatArray) -> FloatArray:
         """Return the twist (6, j) of a frame (4, 4) of a body by joint values (j,), about its
@@ -395,10 +391,8 @@ def get_value(graph: JointGraph, q: FloatArray, joint: GraphJoint) -> float:
 
 def count_repeated_closures(graph: JointGraph, q: FloatArray) -> int:
     """Return how many closure equations repeat others at a pose (j,)."""
-    rows = graph.linearize(q[None])[1][0]
-    rank = len(graph.coupled[1]) + sum({"R": 5, "P": 5, "S": 3}[j.kind] for j in graph.closing)
-    s = np.linalg.svd(rows, compute_uv=False) if rows.size else np.zeros(0)
-    return rank - int(are_nonzero(s, CLOSURE_RANK_TOLERANCE).sum())
+    count = len(graph.coupled[1]) + sum({"R": 5, "P": 5, "S": 3}[j.kind] for j in graph.closing)
+    return count - (len(q) - graph.find_motions(q).shape[1])
 
 
 def _list_limits(graph: JointGraph) -> tuple[FloatArray, FloatArray]:
