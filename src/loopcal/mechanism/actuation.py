@@ -244,20 +244,14 @@ def invert_sum_rows(
     """
     units = measure_sums(robot, weights)
     rows = stack_sum_rows(robot.program, blocks, weights * units[:, None])
-    inverse = _invert_rows(rows)
+    if rows.shape[2] == rows.shape[3]:
+        inverse = invert_weights(rows)
+    else:
+        orthogonal, triangle = np.linalg.qr(np.nan_to_num(rows))
+        inverse = np.matmul(invert_weights(triangle), np.swapaxes(orthogonal, -1, -2))
+        inverse[~np.isfinite(rows).all(axis=(-1, -2))] = np.nan
     inverse[..., -len(units) :] *= units
     return inverse
-
-
-def _invert_rows(rows: FloatArray) -> FloatArray:
-    """Return the inverses of rows (.., c, m), c >= m, see `invert_sum_rows`."""
-    c, m = rows.shape[-2:]
-    if c == m:
-        return invert_weights(rows)
-    orthogonal, triangle = np.linalg.qr(np.nan_to_num(rows))
-    is_finite = np.isfinite(rows).all(axis=(-1, -2), keepdims=True)
-    product = np.matmul(invert_weights(triangle), np.swapaxes(orthogonal, -1, -2))
-    return np.where(is_finite, product, np.nan)
 
 
 def differentiate_open_sums(

@@ -202,12 +202,10 @@ def _choose_axes(vectors: FloatArray) -> FloatArray:
     """Return orthonormal vectors that span the same space as vectors (r, 3): axes of the base that
     it contains, then others, whose largest component is positive.
     """
-    basis = _find_basis(vectors) if len(vectors) else vectors
+    basis = _find_basis(vectors)
     chosen = [axis for axis in np.eye(3) if np.linalg.norm(axis - basis.T @ (basis @ axis)) < SAME]
-    if len(chosen) < len(basis):
-        known = np.array(chosen).reshape(-1, 3)
-        rest = basis - basis @ known.T @ known
-        chosen += list(_find_basis(rest))
+    known = np.reshape(chosen, (-1, 3))
+    chosen += list(_find_basis(basis - basis @ known.T @ known))
     signed = [axis * np.sign(axis[np.abs(axis).argmax()]) for axis in chosen]
     return np.array(signed).reshape(-1, 3)
 

@@ -277,32 +277,22 @@ def _scale_closure(robot: Mechanism, state: State) -> tuple[FloatArray, FloatArr
     program, blocks = robot.program, linearize_state(robot, state)
     A, Q = (rows[0] for rows in reduce_to_platform(program, blocks))
     if robot.has_sums:
-        A, Q = _sum_rows(robot, state, A, Q)
+        e, tau = robot.slots(robot.values[None])
+        weights = select_weights(tau, robot.slots.constants)
+        assert weights is not None
+        chosen = ~find_fixed_rows(robot.slots.constants)  # sums of commanded readings
+        if robot.has_open_sums:  # dy/ds^+ dy - ds = 0
+            moved = differentiate_unknowns_by_sums(robot, e, state, weights)[0]
+            A = np.linalg.pinv(
+                np.nan_to_num(moved[:, : A.shape[2], chosen], posinf=0.0, neginf=0.0)
+            )
+            Q = np.tile(-np.eye(A.shape[1]), (len(A), 1, 1))
+        else:
+            Q = np.matmul(Q, invert_weights(weights))[..., chosen]
     A = A / robot.twist_scale[list(program.freedoms)]
     Q = Q / robot.drive_units[: Q.shape[2]]
     good = np.asarray(np.isfinite(A).all(axis=(1, 2)) & np.isfinite(Q).all(axis=(1, 2)))
     return np.where(good[:, None, None], A, 0.0), np.where(good[:, None, None], Q, 0.0), good
-
-
-def _sum_rows(
-    robot: Mechanism, state: State, A: FloatArray, Q: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return closure rows against freedoms (n, c, m) and against sums (n, c, a) of a state (1, n).
-
-    A, Q : against freedoms and joints. The rows of open sums are dy/ds^+ dy - ds = 0, with the
-    sums of commanded readings.
-    """
-    e, tau = robot.slots(robot.values[None])
-    weights = select_weights(tau, robot.slots.constants)
-    assert weights is not None
-    if robot.has_open_sums:
-        moved = differentiate_unknowns_by_sums(robot, e, state, weights)[0]
-        chosen = ~find_fixed_rows(robot.slots.constants)
-        by_sums = moved[:, : A.shape[2]][..., chosen]
-        rows = np.linalg.pinv(np.where(np.isfinite(by_sums), by_sums, 0.0))
-        return rows, np.tile(-np.eye(rows.shape[1]), (len(rows), 1, 1))
-    chosen = ~find_fixed_rows(robot.slots.constants)
-    return A, np.matmul(Q, invert_weights(weights))[..., chosen]
 
 
 def _compute_chain_margins(

@@ -307,34 +307,30 @@ class Freedoms:
     firmness: float
 
 
-def find_homes(graph: JointGraph) -> tuple[FloatArray, ...]:
+def find_homes(graph: JointGraph) -> tuple[list[FloatArray], bool]:
     """Return joint values (j,) that close the loops, those within their limits and nearest to zero
-    first, without poses of larger mobility; raises MechanismError where the loops do not close.
+    first, without poses of larger mobility, and whether the first is the pose that all joints have
+    at zero, or at a limit near it; raises MechanismError where the loops do not close.
     """
-    low, high = _list_limits(graph)
+    limits = [joint.limits or (-np.inf, np.inf) for joint in graph.tree]
+    low, high = np.array(limits, dtype=float).reshape(-1, 2).T
     rest = np.clip(np.zeros(len(low)), low, high)
     spreads = [0.0, *[SPREAD] * (STARTS - 1)]  # of the starts from zero: the first is there
     drawn = [np.random.default_rng(i).uniform(-s, s, len(rest)) for i, s in enumerate(spreads)]
     starts = np.stack([rest + shift * graph.units for shift in drawn])
-    closed = [q for q in graph.close(starts) if np.isfinite(q).all()]
-    if not closed:
+    closed = graph.close(starts)
+    closed = closed[np.isfinite(closed).all(axis=1)]
+    if not len(closed):
         raise MechanismError(_describe_gap(graph, starts))
-    mobilities = [graph.find_motions(q).shape[1] for q in closed]
-    regular = [q for q, m in zip(closed, mobilities, strict=True) if m == min(mobilities)]
-    inside = [bool(((low - SAME <= q) & (q <= high + SAME)).all()) for q in regular]
-    distances = [float((((q - rest) / graph.units) ** 2).sum()) for q in regular]
-    order = sorted(range(len(regular)), key=lambda i: (not inside[i], distances[i]))
+    mobilities = np.array([graph.find_motions(q).shape[1] for q in closed])
+    regular = closed[mobilities == mobilities.min()]
+    is_outside = ((regular < low - SAME) | (regular > high + SAME)).any(axis=1)
+    distance = (((regular - rest) / graph.units) ** 2).sum(axis=1)
     homes: list[FloatArray] = []
-    for q in (regular[i] for i in order):
+    for q in regular[np.lexsort((distance, is_outside))]:
         if all(np.abs((q - other) / graph.units).max(initial=0.0) > SAME for other in homes):
             homes.append(q)
-    return tuple(homes)
-
-
-def is_drawn_pose(graph: JointGraph, q: FloatArray) -> bool:
-    """Return whether a pose (j,) is the one that all joints have at zero, or at a limit near it."""
-    rest = np.clip(np.zeros(len(q)), *_list_limits(graph))
-    return bool(np.abs((q - rest) / graph.units).max(initial=0.0) < DRAWN)
+    return homes, bool(np.abs((homes[0] - rest) / graph.units).max(initial=0.0) < DRAWN)
 
 
 def find_freedoms(graph: JointGraph, q: FloatArray, platform: str) -> Freedoms:
@@ -375,11 +371,6 @@ def list_nearby(graph: JointGraph, home: FloatArray) -> FloatArray:
     return near[np.isfinite(near).all(axis=1)]
 
 
-def measure_rotation(graph: JointGraph, q: FloatArray, joint: GraphJoint) -> FloatArray:
-    """Return the rotation (3, 3) of a joint that closes a loop, at joint values (j,)."""
-    return graph.relate(graph.place(q[None]), joint)[:3, :3]
-
-
 def get_value(graph: JointGraph, q: FloatArray, joint: GraphJoint) -> float:
     """Return the value of a rotary joint or slide [rad, m], also of one that closes a loop."""
     for i, other in enumerate(graph.tree):
@@ -393,13 +384,6 @@ def count_repeated_closures(graph: JointGraph, q: FloatArray) -> int:
     """Return how many closure equations repeat others at a pose (j,)."""
     count = len(graph.coupled[1]) + sum({"R": 5, "P": 5, "S": 3}[j.kind] for j in graph.closing)
     return count - (len(q) - graph.find_motions(q).shape[1])
-
-
-def _list_limits(graph: JointGraph) -> tuple[FloatArray, FloatArray]:
-    """Return lower and upper limits (j,) of the joints of the tree, infinite without limits."""
-    limits = [joint.limits or (-np.inf, np.inf) for joint in graph.tree]
-    low, high = np.array(limits, dtype=float).reshape(-1, 2).T
-    return low, high
 
 
 def measure_gap(graph: JointGraph, placement: Placement, joint: GraphJoint) -> tuple[float, float]:

@@ -25,7 +25,6 @@ from loopcal.mechanism.joint_graph.loops import (
     Repair,
     find_freedoms,
     find_homes,
-    is_drawn_pose,
     list_nearby,
     repair_rounded_loops,
 )
@@ -342,12 +341,12 @@ def find_stage_paths(
             raise MechanismError(finding)
     if all(block.is_serial for block in blocks):
         blocks = (Block(graph, platform),)
-    homes = find_homes(graph)
+    homes, is_drawn = find_homes(graph)
     moving = [find_freedoms(graph, q, platform) for q in homes]
-    share = FIRM_DRAWN if is_drawn_pose(graph, homes[0]) else FIRM
-    limit = share * max(freedoms.firmness for freedoms in moving)
-    pairs = zip(homes, moving, strict=True)
-    home, motions = next(pair for pair in pairs if pair[1].firmness >= limit)
+    limit = (FIRM_DRAWN if is_drawn else FIRM) * max(own.firmness for own in moving)
+    home, motions = next(
+        pair for pair in zip(homes, moving, strict=True) if pair[1].firmness >= limit
+    )
     stages: list[ClosedStage | SerialStage] = []
     for block, mount in map(_turn_base, blocks):
         frame = locate_frame(block.platform)
@@ -551,19 +550,18 @@ def couple_joints(
     if not known:
         return graph, tuple(couplings)
     left = [c for c in couplings if c not in known or not c.factor]
-    near = list_nearby(graph, find_homes(graph)[0]) if graph.closing else np.zeros((0, 0))
+    near = list_nearby(graph, find_homes(graph)[0][0]) if graph.closing else np.zeros((0, 0))
     known = [c for c in known if c.factor and not _is_contained(graph, near, c)]
-    laws = {joint.name: (joint.name, 1.0, 0.0) for joint in graph.tree if joint.drive}
-    for first in (None, *known):
-        if first is not None:  # joints that no motor moves follow the first of them
-            laws.setdefault(first.leader, (first.leader, 1.0, 0.0))
-        for c in known * len(known):
+    back = [Coupling(c.leader, c.joint, 1 / c.factor, -c.offset / c.factor) for c in known]
+    both = [c for pair in zip(known, back, strict=True) for c in pair]
+    laws: dict[str, tuple[str, float, float]] = {}
+    # joints that no motor moves follow the first of them
+    for leaders in ([j.name for j in graph.tree if j.drive], *([c.leader] for c in known)):
+        laws = {name: (name, 1.0, 0.0) for name in leaders} | laws
+        for c in both * len(known):
             if c.leader in laws:
                 drive, ratio, offset = laws[c.leader]
                 laws.setdefault(c.joint, (drive, c.factor * ratio, c.factor * offset + c.offset))
-            elif c.joint in laws:
-                drive, ratio, offset = laws[c.joint]
-                laws[c.leader] = drive, ratio / c.factor, (offset - c.offset) / c.factor
     for c in known:
         (drive, *values), (other, ratio, offset) = laws[c.joint], laws[c.leader]
         expected = c.factor * ratio, c.factor * offset + c.offset

@@ -38,12 +38,7 @@ from loopcal.mechanism.assembly import BASE, PLATFORM
 from loopcal.mechanism.families.limbs import Limbs, Prismatic, Revolute, matrix_from_place
 from loopcal.mechanism.families.stages import PlacedStages
 from loopcal.mechanism.joint_graph.graph import GraphJoint, choose_coordinates
-from loopcal.mechanism.joint_graph.loops import (
-    JointGraph,
-    count_repeated_closures,
-    get_value,
-    measure_rotation,
-)
+from loopcal.mechanism.joint_graph.loops import JointGraph, count_repeated_closures, get_value
 from loopcal.mechanism.joint_graph.paths import (
     ClosedStage,
     GraphLimb,
@@ -494,8 +489,8 @@ def _describe_limb_joint(paths: ClosedStage, joint: GraphJoint, place: FloatArra
     """Return a joint of a limb."""
     content = {"joint": joint.kind, "name": joint.name, "at": describe_pose(place)}
     if joint.kind == "S":
-        R = measure_rotation(paths.graph, paths.home, joint)
-        roll, pitch, yaw = geometry.matrix_to_euler(R, "xyz")
+        T = paths.graph.relate(paths.graph.place(paths.home[None]), joint)
+        roll, pitch, yaw = geometry.matrix_to_euler(T[:3, :3], "xyz")
         return {**content, "start": _clear((yaw, pitch, roll))}
     start = get_value(paths.graph, paths.home, joint)
     motor = {"actuated": joint.drive} if _is_actuated(paths, joint) else {}
