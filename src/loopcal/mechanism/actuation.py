@@ -12,8 +12,6 @@ from loopcal import engine, geometry
 from loopcal.engine import Program, State
 from loopcal.mechanism.limb_rows import (
     differentiate_displacements,
-    expand_map,
-    join_columns,
     linearize_limbs,
     move_passive_joints,
     name_entries,
@@ -34,6 +32,7 @@ from loopcal.mechanism.transmission import (
     joints_from_readings,
     readings_from_joints,
     select_weights,
+    term_derivatives,
 )
 from loopcal.numerics.trial_batch import map_arrays
 from loopcal.typing import FloatArray, IntArray
@@ -147,12 +146,8 @@ def differentiate_at_pose(
     """
     program, p, m = robot.program, len(robot.parameters), len(robot.freedoms)
     displacements, M = differentiate_displacements(robot, values), len(program.unknown_twists)
-    a, weights = len(robot.assembly.rows) - len(robot.assembly.couplings), np.eye(program.n_joints)
-    if robot.has_sums:
-        weights, moved = _differentiate_sums(robot, values, q, state)
-    else:
-        by_inputs = differentiate_driven_joints(robot, values, q)
-        weights, moved = weights[None, None], Derivatives(by_inputs[..., :p], by_inputs[..., p:])
+    a = len(robot.assembly.rows) - len(robot.assembly.couplings)
+    weights, moved = _differentiate_sums(robot, values, q, driven_values(program, state))
     unknown = np.zeros((*state.T.shape[:2], M + program.n_joints, p + m))
     unknown[:, :, :m, p:] = np.eye(m)
     for rows, blocks in linearize_limbs(robot, values, state):
@@ -267,7 +262,8 @@ def differentiate_open_sums(
     for rows, blocks in linearize_limbs(robot, values, state):
         own, readings = select_block(values, rows[:1]), select_block(q, rows)
         block = map_arrays(lambda a, rows=rows: a[rows], state)
-        weights, moved = _differentiate_sums(robot, own, readings, block)
+        lengths = driven_values(program, block)
+        weights, moved = _differentiate_sums(robot, own, readings, lengths)
         inverse = invert_sum_rows(robot, blocks, weights[:, 0])
         E = stack_displacement_columns(program, blocks)
         opened = np.matmul(E, select_block(displacements, rows[:1])[:, None])
@@ -281,12 +277,9 @@ def differentiate_driven_joints(robot: Mechanism, values: FloatArray, q: FloatAr
     """Return derivatives (t | 1, n | 1, J, p + a) of driven joints, without open sums, by
     parameters in SI and by readings.
     """
-    inputs = robot.all_parameters.linearize(values, robot.slots(values)[1], q)
-    joints = expand_map(robot.program, inputs)[1]
-    if robot.has_sums:  # of which the map knows no reading
-        turns = differentiate_joints_by_readings(robot, values, q)
-        return join_columns(joints[..., : len(robot.parameters)], turns)
-    return joints
+    joints = drive_joints(robot, values, q).joints
+    weights, moved = _differentiate_sums(robot, values, q, joints)
+    return np.matmul(invert_weights(weights), np.concatenate(moved, axis=3))
 
 
 def differentiate_joints_by_readings(
@@ -301,20 +294,22 @@ def differentiate_joints_by_readings(
 
 
 def _differentiate_sums(
-    robot: Mechanism, values: FloatArray, q: FloatArray, state: State
+    robot: Mechanism, values: FloatArray, q: FloatArray, lengths: FloatArray
 ) -> tuple[FloatArray, Derivatives]:
-    """Return the weights (t | 1, 1, a, J), and the derivatives of s - W l at constant lengths l."""
-    slots = robot.slots
-    _, tau = slots(values)
-    weights = select_weights(tau, robot.slots.constants)
-    assert weights is not None
-    lengths = driven_values(robot.program, state)
-    by_terms = differentiate_sums(q, tau, slots.constants, lengths)
+    """Return the weights (t | 1, 1, a, J), and the derivatives of s - W l at constant lengths l
+    (t, n, J); without sums each reading has its own joint.
+    """
+    slots, (_, tau) = robot.slots, robot.slots(values)
+    weights = select_weights(tau, slots.constants)
+    if weights is None:
+        by_terms = np.stack(term_derivatives(q, tau, slots.constants), axis=3)
+        weights = np.eye(robot.program.n_joints)[None]
+    else:
+        by_terms = differentiate_sums(q, tau, slots.constants, lengths)
     of_terms = slots.jacobian(values)[:, slots.n_displacements :]
     of_terms = of_terms.reshape(len(of_terms), *slots.terms.shape, -1)
     by_parameters = np.moveaxis(np.matmul(np.moveaxis(by_terms, 2, 1), of_terms), 1, 2)
     by_readings = differentiate_by_readings(q, tau, slots.constants)
-    shapes = by_parameters.shape[:2], by_readings.shape[:2], lengths.shape[:2]
-    lead = np.broadcast_shapes(*shapes)
+    lead = np.broadcast_shapes(*(a.shape[:2] for a in (by_parameters, by_readings, lengths)))
     both = (np.broadcast_to(a, (*lead, *a.shape[2:])) for a in (by_parameters, by_readings))
     return weights[:, None], Derivatives(*both)

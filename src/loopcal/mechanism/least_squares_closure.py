@@ -25,8 +25,8 @@ from typing import NamedTuple
 import numpy as np
 
 from loopcal import engine, geometry
-from loopcal.engine import Group, ParameterMap, Program, State
-from loopcal.mechanism.limb_rows import divide_limbs, expand_map, follow_limb, measure_rod
+from loopcal.engine import Group, Program, State
+from loopcal.mechanism.limb_rows import divide_limbs, follow_limb, measure_rod
 from loopcal.mechanism.states import make_start
 from loopcal.typing import FloatArray, IntArray
 
@@ -102,13 +102,20 @@ class _Rows(NamedTuple):
 
 
 def differentiate_unknowns(
-    program: Program, e: FloatArray, q: FloatArray, state: State, inputs: ParameterMap
+    program: Program,
+    e: FloatArray,
+    q: FloatArray,
+    state: State,
+    displacements: FloatArray,
+    joints: FloatArray,
 ) -> FloatArray:
-    """Differentiate the unknowns of a least-squares closure, (t, n, u, p + a): the freedoms of all
-    nodes, then the joints of `list_unknown_joints`. Arguments are those of
-    `loopcal.engine.differentiate`.
+    """Differentiate the unknowns of a least-squares closure, (t, n, u, w): the freedoms of all
+    nodes, then the joints of `list_unknown_joints`.
+
+    Arguments are those of `loopcal.engine.differentiate`, and the derivatives of displacements
+    (t | 1, d, p) and driven joints (t | 1, n | 1, J, w) by w inputs, p parameters first.
     """
-    (t, n), whole, p = state.T.shape[:2], program.with_driven_joints, inputs.pattern.parameters
+    (t, n), whole, p = state.T.shape[:2], program.with_driven_joints, displacements.shape[2]
     values = whole.list_drives(
         tuple(
             np.broadcast_to(g.insert_driven(own, q), (t, n, *own.shape[2:]))
@@ -118,11 +125,10 @@ def differentiate_unknowns(
     drive = np.full(whole.n_joints, -1)  # of each joint
     for group, driven in zip(program.groups, whole.groups, strict=True):
         drive[driven.actuator[driven.actuator >= 0]] = group.actuator[driven.actuator >= 0]
-    displacements, joints = expand_map(program, inputs)
     displacements = np.broadcast_to(displacements, (t, *displacements.shape[1:]))
     joints = np.broadcast_to(joints, (t, n, *joints.shape[2:]))
     count = len(program.unknown_twists) + len(list_unknown_joints(program))
-    out = np.zeros((t * n, count, p + program.n_joints))
+    out = np.zeros((t * n, count, joints.shape[3]))
     for first in range(0, t * n, CHUNK):
         trial, pose = np.divmod(np.arange(first, min(first + CHUNK, t * n)), n)
         own = e[trial if len(e) > 1 else 0 * trial]

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from loopcal import engine, geometry
-from loopcal.engine import LENGTH, PITCH, Group, ParameterMap, Program, State
+from loopcal.engine import LENGTH, PITCH, Group, Program, State
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.states import driven_values
 from loopcal.numerics.trial_batch import map_arrays
@@ -111,32 +111,6 @@ def select_block(array: FloatArray, rows: tuple[slice, ...]) -> FloatArray:
 def differentiate_displacements(robot: Mechanism, values: FloatArray) -> FloatArray:
     """Return the derivatives (t | 1, d, p) of displacements by parameters in SI."""
     return robot.slots.jacobian(values)[:, : robot.program.n_displacements]
-
-
-def expand_map(program: Program, inputs: ParameterMap) -> tuple[FloatArray, FloatArray]:
-    """Return the derivatives of displacements (t | 1, d, p) by parameters, and of driven joints (t
-    | 1, n | 1, J, p + J) by parameters and readings.
-    """
-    pattern, p = inputs.pattern, inputs.pattern.parameters
-    place, parameter = pattern.displacements.T
-    displacements = np.zeros((len(inputs.displacements), program.n_displacements, p))
-    displacements[:, place, parameter] = inputs.displacements
-    shape = max(len(inputs.basis), len(inputs.joints)), inputs.basis.shape[1]
-    joints = np.zeros((*shape, program.n_joints, p))
-    for i in range(inputs.basis.shape[3]):
-        own = pattern.joints[:, 1] == i
-        column, _, parameter = pattern.joints[own].T
-        slopes = inputs.basis[:, :, column, i] * inputs.joints[:, None, own]
-        joints[:, :, column, parameter] += slopes
-    by_readings = inputs.readings[..., None] * np.eye(program.n_joints)
-    return displacements, join_columns(joints, by_readings)
-
-
-def join_columns(first: FloatArray, second: FloatArray) -> FloatArray:
-    """Return columns (.., r, c) and (.., r, d) side by side; leading axes of 1 broadcast."""
-    lead = np.broadcast_shapes(first.shape[:-1], second.shape[:-1])
-    both = (np.broadcast_to(a, (*lead, a.shape[-1])) for a in (first, second))
-    return np.concatenate(list(both), axis=-1)
 
 
 def move_passive_joints(

@@ -92,6 +92,13 @@ class ParameterUnits:
             return np.ones((1, 1, len(w), len(terms)))
         return np.stack(term_derivatives(q, tau, w, terms), axis=-1)
 
+    def select(self, by_all: FloatArray) -> FloatArray:
+        """Return derivatives (.., p + a) by these parameters and what follows, of those by all
+        parameters in SI.
+        """
+        rest = by_all[..., len(self.slots.nominal) :]
+        return np.concatenate([by_all[..., self.places] * self.units, rest], axis=-1)
+
     @cached_property
     def _entries(self) -> tuple[IntArray, IntArray, FloatArray]:
         """Slots that may move, by which column of all parameters, and its unit, (z,) each."""

@@ -30,7 +30,12 @@ from loopcal.mechanism.actuation import (
 )
 from loopcal.mechanism.chains import each_stage, locate_bodies, transport_to_end
 from loopcal.mechanism.least_squares_closure import differentiate_unknowns, list_unknown_joints
-from loopcal.mechanism.limb_rows import move_passive_joints, name_entries, name_passive_joints
+from loopcal.mechanism.limb_rows import (
+    differentiate_displacements,
+    move_passive_joints,
+    name_entries,
+    name_passive_joints,
+)
 from loopcal.mechanism.model import Mechanism, ParameterUnits
 from loopcal.mechanism.states import is_closed
 from loopcal.mechanism.transmission import apply_weights, invert_weights
@@ -89,19 +94,14 @@ def _differentiate_unknowns(
     """Return derivatives (t, n, u, p + a), by parameters and readings, of the freedoms of all
     nodes, then of driven joints whose sums are open, or of joints of loops that may stay open.
     """
-    p = len(robot.parameters)
     if robot.has_open_sums:
-        moved = differentiate_open_sums(robot, values, q, state)
-        own = moved[..., columns.places] * columns.units
-        return np.concatenate([own, moved[..., p:]], axis=3)
-    e, tau, joints = drive_joints(robot, values, q)
-    inputs = columns.linearize(values, tau, q)
-    exact = differentiate_unknowns(robot.program, e, joints, state, inputs)
-    if not robot.has_sums:
-        return exact
-    own, by_joints = np.split(exact, [len(columns.places)], axis=3)
-    turns = differentiate_joints_by_readings(robot, values, q)
-    return np.concatenate([own, by_joints @ turns], axis=3)
+        return columns.select(differentiate_open_sums(robot, values, q, state))
+    e, _, joints = drive_joints(robot, values, q)
+    moved = (
+        differentiate_displacements(robot, values),
+        differentiate_driven_joints(robot, values, q),
+    )
+    return differentiate_unknowns(robot.program, e, joints, state, *map(columns.select, moved))
 
 
 def differentiate_platform(
@@ -150,14 +150,15 @@ def differentiate_by_drives(
         joints = apply_weights(inverse, u)
         by_joints = differentiate_by_drives(robot, e, joints, state, None)
         return np.matmul(by_joints, inverse[:, None])
-    given = robot.program, e, u, state, robot.program.drive_map
+    program = robot.program
     if weights is not None:
         moved = differentiate_unknowns_by_sums(robot, e, state, weights)
-    elif robot.program.may_stay_open:
-        moved = differentiate_unknowns(*given)
+    elif program.may_stay_open:
+        none, each = np.zeros((1, program.n_displacements, 0)), np.eye(program.n_joints)[None, None]
+        moved = differentiate_unknowns(program, e, u, state, none, each)
     else:
-        return engine.differentiate(*given)[1]
-    return spread_twists(robot.program, moved)
+        return engine.differentiate(program, e, u, state, program.drive_map)[1]
+    return spread_twists(program, moved)
 
 
 def fold_pose_rows(
@@ -203,24 +204,22 @@ def differentiate_passive_joints(
             first = rows.stop
         return PassiveSensitivity(names, *whole)
     program, p = robot.program, len(robot.parameters)
-    exact = None
-    if program.may_stay_open or robot.has_open_sums:
+    has_more = program.may_stay_open or robot.has_open_sums
+    if has_more:
         unknowns = _differentiate_unknowns(robot, values, q, state, robot.all_parameters)
-        twists, exact = np.split(unknowns, [len(program.unknown_twists)], axis=2)
+        twists, more = np.split(unknowns, [len(program.unknown_twists)], axis=2)
     else:
         nodes = differentiate_pose(robot, values, q, state, nodes=len(program.nodes))
         freedoms = [6 * node + f for node, f in program.unknown_twists]
-        twists = np.concatenate(nodes, axis=3)[:, :, freedoms]
-    if exact is not None and robot.has_open_sums:
-        driven, exact = exact, None
-    else:
-        driven = differentiate_driven_joints(robot, values, q)
+        twists = more = np.concatenate(nodes, axis=3)[:, :, freedoms]
+    is_open = robot.has_open_sums
+    driven = more if is_open else differentiate_driven_joints(robot, values, q)
     by_inputs = move_passive_joints(robot, values, state, twists, driven)
-    if exact is not None:
+    if has_more and not is_open:
         limbs = robot.assembly.limbs
         joints = [(limbs[i], limbs[i].joints[j]) for i, j in list_unknown_joints(program)]
         places = [names.index(f"{limb.name}.{joint.name}") for limb, joint in joints]
-        by_inputs[:, :, places] = exact
+        by_inputs[:, :, places] = more
     by_inputs[~is_closed(state.status)] = np.nan
     return PassiveSensitivity(names, by_inputs[..., :p], by_inputs[..., p:])
 
