@@ -10,7 +10,7 @@ those of the two points and directions, which only the joints below each body mo
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations
@@ -67,6 +67,11 @@ class JointGraph:
     def joints(self) -> tuple[GraphJoint, ...]:
         """All joints."""
         return self.tree + self.closing
+
+    def change_joints(self, change: Callable[[GraphJoint], GraphJoint]) -> JointGraph:
+        """Return the mechanism with other places of its joints."""
+        tree, closing = (tuple(map(change, joints)) for joints in (self.tree, self.closing))
+        return replace(self, tree=tree, closing=closing)
 
     @cached_property
     def names(self) -> tuple[str, ...]:
@@ -504,13 +509,8 @@ def _align_axes(graph: JointGraph, q: FloatArray, limit: float) -> tuple[JointGr
         far = A @ near.move(np.array(value))
         return replace(near, T_b=geometry.invert_pose(B) @ far)
 
-    turned = replace(
-        graph,
-        tree=tuple(move(joint) for joint in graph.tree),
-        closing=tuple(move(joint) for joint in graph.closing),
-    )
     turns = [np.linalg.norm(np.cross(axes[joint], aligned[joint])) for joint in moving]
-    return turned, float(max(turns, default=0.0))
+    return graph.change_joints(move), float(max(turns, default=0.0))
 
 
 def _meet(lines: FloatArray, limit: float) -> FloatArray:

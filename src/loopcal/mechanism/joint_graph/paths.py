@@ -410,12 +410,8 @@ def _repair_blocks(
         if not block.is_serial
     ]
     joints = {joint.name: joint for repair in repairs for joint in repair.graph.joints}
-    tree, closing = (
-        tuple(joints.get(joint.name, joint) for joint in before)
-        for before in (graph.tree, graph.closing)
-    )
     return Repair(
-        replace(graph, tree=tree, closing=closing),
+        graph.change_joints(lambda joint: joints.get(joint.name, joint)),
         max((repair.gap for repair in repairs), default=0.0),
         max((repair.angle for repair in repairs), default=0.0),
         max((repair.turn for repair in repairs), default=0.0),
@@ -445,8 +441,7 @@ def _turn_base(block: Block) -> tuple[Block, FloatArray]:
         far = inverse @ joint.T_b if joint.body_b == base else joint.T_b
         return replace(joint, T_a=near, T_b=far)
 
-    tree, closing = (tuple(map(move, joints)) for joints in (graph.tree, graph.closing))
-    return replace(block, graph=replace(graph, tree=tree, closing=closing)), mount
+    return replace(block, graph=graph.change_joints(move)), mount
 
 
 def _align_frame(
