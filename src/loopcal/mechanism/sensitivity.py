@@ -29,7 +29,11 @@ from loopcal.mechanism.actuation import (
     drive_joints,
 )
 from loopcal.mechanism.chains import each_stage, locate_bodies, transport_to_end
-from loopcal.mechanism.least_squares_closure import differentiate_unknowns, list_unknown_joints
+from loopcal.mechanism.least_squares_closure import (
+    differentiate_unknowns,
+    find_open_loops,
+    list_unknown_joints,
+)
 from loopcal.mechanism.limb_rows import (
     differentiate_displacements,
     move_passive_joints,
@@ -60,17 +64,24 @@ def differentiate_pose(
     if robot.stages:
         return differentiate_platform(robot, values, q, state, columns)
     chosen = columns or robot.all_parameters
-    if robot.has_open_sums or robot.program.may_stay_open:
-        moved = _differentiate_unknowns(robot, values, q, state, chosen)
-        twists = spread_twists(robot.program, moved, nodes)
-        derivatives = np.split(twists, [len(chosen.places)], axis=3)
+    p = len(chosen.places)
+    if robot.has_open_sums:
+        moved = chosen.select(differentiate_open_sums(robot, values, q, state))
+        derivatives = np.split(spread_twists(robot.program, moved, nodes), [p], axis=3)
     else:
         e, tau, joints = drive_joints(robot, values, q)
         inputs = chosen.linearize(values, tau, q)
         by_parameters, turned = engine.differentiate(robot.program, e, joints, state, inputs, nodes)
         if robot.has_sums:
             turned = np.matmul(turned, differentiate_joints_by_readings(robot, values, q))
-        derivatives = by_parameters, turned
+        derivatives = [by_parameters, turned]
+    is_open = find_open_loops(robot, state)
+    if is_open.any():
+        moved = spread_twists(
+            robot.program, _differentiate_open(robot, values, q, state, chosen), nodes
+        )
+        for derivative, own in zip(derivatives, np.split(moved, [p], axis=3), strict=True):
+            derivative[is_open] = own[is_open]
     lost = ~is_closed(state.status)
     if lost.any():
         for derivative in derivatives:
@@ -88,20 +99,18 @@ def spread_twists(program: engine.Program, moved: FloatArray, nodes: int = 1) ->
     return out
 
 
-def _differentiate_unknowns(
+def _differentiate_open(
     robot: Mechanism, values: FloatArray, q: FloatArray, state: State, columns: ParameterUnits
 ) -> FloatArray:
-    """Return derivatives (t, n, u, p + a), by parameters and readings, of the freedoms of all
-    nodes, then of driven joints whose sums are open, or of joints of loops that may stay open.
+    """Return derivatives (t, n, u, p + a), by parameters and readings, of the unknowns of a
+    least-squares closure.
     """
-    if robot.has_open_sums:
-        return columns.select(differentiate_open_sums(robot, values, q, state))
     e, _, joints = drive_joints(robot, values, q)
-    moved = (
+    by_all = (
         differentiate_displacements(robot, values),
         differentiate_driven_joints(robot, values, q),
     )
-    return differentiate_unknowns(robot.program, e, joints, state, *map(columns.select, moved))
+    return differentiate_unknowns(robot, e, joints, state, *map(columns.select, by_all))
 
 
 def differentiate_platform(
@@ -150,15 +159,9 @@ def differentiate_by_drives(
         joints = apply_weights(inverse, u)
         by_joints = differentiate_by_drives(robot, e, joints, state, None)
         return np.matmul(by_joints, inverse[:, None])
-    program = robot.program
-    if weights is not None:
-        moved = differentiate_unknowns_by_sums(robot, e, state, weights)
-    elif program.may_stay_open:
-        none, each = np.zeros((1, program.n_displacements, 0)), np.eye(program.n_joints)[None, None]
-        moved = differentiate_unknowns(program, e, u, state, none, each)
-    else:
-        return engine.differentiate(program, e, u, state, program.drive_map)[1]
-    return spread_twists(program, moved)
+    if weights is None:
+        return engine.differentiate(robot.program, e, u, state, robot.program.drive_map)[1]
+    return spread_twists(robot.program, differentiate_unknowns_by_sums(robot, e, state, weights))
 
 
 def fold_pose_rows(
@@ -204,22 +207,22 @@ def differentiate_passive_joints(
             first = rows.stop
         return PassiveSensitivity(names, *whole)
     program, p = robot.program, len(robot.parameters)
-    has_more = program.may_stay_open or robot.has_open_sums
-    if has_more:
-        unknowns = _differentiate_unknowns(robot, values, q, state, robot.all_parameters)
-        twists, more = np.split(unknowns, [len(program.unknown_twists)], axis=2)
+    if robot.has_open_sums:
+        moved = differentiate_open_sums(robot, values, q, state)
+        twists, driven = np.split(moved, [len(program.unknown_twists)], axis=2)
     else:
         nodes = differentiate_pose(robot, values, q, state, nodes=len(program.nodes))
         freedoms = [6 * node + f for node, f in program.unknown_twists]
-        twists = more = np.concatenate(nodes, axis=3)[:, :, freedoms]
-    is_open = robot.has_open_sums
-    driven = more if is_open else differentiate_driven_joints(robot, values, q)
+        twists = np.concatenate(nodes, axis=3)[:, :, freedoms]
+        driven = differentiate_driven_joints(robot, values, q)
     by_inputs = move_passive_joints(robot, values, state, twists, driven)
-    if has_more and not is_open:
-        limbs = robot.assembly.limbs
-        joints = [(limbs[i], limbs[i].joints[j]) for i, j in list_unknown_joints(program)]
-        places = [names.index(f"{limb.name}.{joint.name}") for limb, joint in joints]
-        by_inputs[:, :, places] = more
+    is_open = find_open_loops(robot, state)
+    if is_open.any():
+        own = _differentiate_open(robot, values, q, state, robot.all_parameters)
+        for i, (g, k, j) in enumerate(list_unknown_joints(program), len(program.unknown_twists)):
+            limb = robot.assembly.limbs[program.groups[g].limbs[k]]
+            place = names.index(f"{limb.name}.{limb.joints[j].name}")
+            by_inputs[is_open, place] = own[is_open, i]
     by_inputs[~is_closed(state.status)] = np.nan
     return PassiveSensitivity(names, by_inputs[..., :p], by_inputs[..., p:])
 
