@@ -219,19 +219,6 @@ class Program:
         return replace(self, freedoms=())
 
     @cached_property
-    def with_driven_joints(self) -> Program:
-        """The same limbs with each joint driven by an actuator of its own, and all closure rows."""
-        groups, count = [], 0
-        for group in self.groups:
-            joints, k = len(group.joints) + (group.ending == "distance"), len(group.limbs)
-            actuator = np.full((len(group.joints) + 1, k), -1)
-            actuator[:joints] = count + np.arange(joints * k).reshape(joints, k)
-            count += joints * k
-            rows = tuple(range(ENDINGS[group.ending]))
-            groups.append(replace(group, actuator=actuator, rows=rows))
-        return replace(self, groups=tuple(groups), n_joints=count)
-
-    @cached_property
     def idle_groups(self) -> tuple[int, ...]:
         """Groups of limbs without a drive that constrain nothing: their joints follow the platform.
 

@@ -192,7 +192,7 @@ def reduce_to_platform(
     return rows[..., :m], rows[..., m:]
 
 
-# Frames along a limb for displacements and joint values, and the length of its rod.
+# Frames along a limb for displacements and joint values.
 
 
 def follow_limb(
@@ -242,19 +242,7 @@ def place_links(group: Group, k: int, displacements: FloatArray) -> tuple[FloatA
     """Return the displaced links (t, J + 2, 4, 4) of limb k, the attachment last, and the pitches
     (t, J) of its joints, for its displacements (t, s).
     """
-    move, pitch = sum_displacements(group, k, displacements)
-    if not move.any():  # at nominal values
-        return np.broadcast_to(group.links[k], (len(move), *group.links[k].shape)), pitch
-    displaced = geometry.make_pose(geometry.exp_so3(move[..., :3]), move[..., 3:])
-    return group.links[k] @ displaced, pitch
-
-
-def sum_displacements(
-    group: Group, k: int, displacements: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return how the links of limb k move, (t, J + 2, 6) rotations and translations in their own
-    frames, the attachment last, and the pitches (t, J) of its joints, for displacements (t, s).
-    """
+    # rotations and translations of the links in their own frames
     move = np.zeros((len(displacements), len(group.joints) + 2, 6))
     pitch = np.broadcast_to(group.pitch[k], (len(displacements), len(group.joints))).copy()
     for slot, value in zip(group.slots, displacements.T, strict=True):
@@ -262,18 +250,10 @@ def sum_displacements(
             pitch[:, slot.element] += value
         elif slot.axis != LENGTH:
             move[:, slot.element, slot.axis] += value
-    return move, pitch
-
-
-def measure_rod(group: Group, k: int, displacements: FloatArray) -> FloatArray:
-    """Return the lengths (t,) of the rod that ends limb k of a group [m], without the value of its
-    joint; 0 without one.
-    """
-    length = np.full(len(displacements), group.length[k] if group.ending == "distance" else 0.0)
-    for slot, value in zip(group.slots, displacements.T, strict=True):
-        if slot.axis == LENGTH:
-            length = length + value
-    return length
+    if not move.any():  # at nominal values
+        return np.broadcast_to(group.links[k], (len(move), *group.links[k].shape)), pitch
+    displaced = geometry.make_pose(geometry.exp_so3(move[..., :3]), move[..., 3:])
+    return group.links[k] @ displaced, pitch
 
 
 def move_joint(letter: str, value: FloatArray, pitch: FloatArray) -> FloatArray:
