@@ -28,6 +28,7 @@ from loopcal.mechanism.kinematics import (
 )
 from loopcal.mechanism.limb_rows import linearize_state
 from loopcal.mechanism.mobility import (
+    RANK,
     STRETCHED,
     check_assembly,
     check_mobility,
@@ -50,6 +51,7 @@ from loopcal.mechanism.transmission import (
     nominal_terms,
     readings_from_joints,
 )
+from loopcal.numerics.decomposition import find_null_space
 from loopcal.parameters import ParameterTable
 from loopcal.typing import FloatArray, IntArray
 from loopcal.units import DISPLAY_UNITS, LARGEST, SI_SYMBOLS, Dimension
@@ -587,9 +589,8 @@ def _find_independent_readings(robot: Mechanism) -> IntArray:
     blocks, count = linearize_state(robot, robot.home_state), sums.chosen
     rows = stack_sum_rows(program, blocks, sums.weights[:, count:])[0, 0]
     lengths = [robot.twist_scale[f] for _, f in program.unknown_twists] + [*robot.joint_units]
-    _, s, V = np.linalg.svd(rows / lengths, full_matrices=True)
-    motions = V[count_rank(s) :, -program.n_joints :] / robot.joint_units
-    moved = motions @ sums.weights[0, :count].T * robot.drive_units[:count]
+    motions = find_null_space(rows / lengths, RANK)[-program.n_joints :].T
+    moved = motions / robot.joint_units @ sums.weights[0, :count].T * robot.drive_units[:count]
     _, _, order = qr(moved, mode="economic", pivoting=True)
     return np.sort(order[: len(moved)])
 
