@@ -38,6 +38,10 @@ def test_priors_of_the_setup_in_a_sheet_count_in_the_plan_and_stay_in_its_sheet(
         for name in ("known", "open")
     )
     assert known["expected"]["after"]["position"] < 0.8 * without["expected"]["after"]["position"]
+    included = [
+        any(f["code"] == "plan.frames-included" for f in of["findings"]) for of in (known, without)
+    ]
+    assert included == [True, False]
     text = (tmp_path / "known" / "measurements.csv").read_text("utf-8")
     assert "tracker.x: {sd: 0.001 mm}" in text
 

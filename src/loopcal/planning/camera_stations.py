@@ -169,6 +169,7 @@ def _describe(robot: Mechanism, view: View) -> Finding:
         width=camera.size[0],
         tilts=(float(tilts.min()), float(tilts.max())),
         seen=100.0 * float(view.shown.mean()),
+        is_large=bool(2.0 * np.linalg.norm(_find_middle(camera)) > robot.size),
         squares=tuple(n + 1 for n in camera.corners),
         square=robot.to_quantity(camera.square, Dimension.LENGTH),
     )

@@ -21,6 +21,7 @@ from loopcal.estimate.free_parameters import describe_null_space
 from loopcal.findings import Finding, Quantity, report_finding
 from loopcal.findings.wording import round_to_digits
 from loopcal.measure.instrument import Instrument
+from loopcal.measure.kinds.setup_parameters import POSITION_AXES, ROTATION_AXES
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import list_dimensions
 from loopcal.mechanism.solutions import inverse
@@ -474,6 +475,12 @@ def _collect_notes(problem: PlanningProblem) -> list[Finding]:
     if frame.fitted or frame.undetermined:
         frames = frame.fitted or frame.undetermined
         notes.append(report_finding("plan.frames-undetermined", frames=frames))
+    else:
+        axes = (*ROTATION_AXES, *POSITION_AXES)
+        stated = [v for v in problem.instrument.stated_values if 0.0 < v.sd < np.inf]
+        parts = [v.name.rpartition(".") for v in stated]
+        if known := tuple(dict.fromkeys(name for name, _, axis in parts if axis in axes)):
+            notes.append(report_finding("plan.frames-included", names=known))
     combinations = describe_null_space(problem.free, problem.observable.null_space())
     if combinations:
         interpreted = interpret_combinations(problem.free, combinations)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from loopcal import geometry, load_robot
+from loopcal import geometry, identify, load_robot
 from loopcal.errors import DataError, LoopcalError
 from loopcal.io.data.measurement_file import load_measurements, save_measurements
 from loopcal.measure.instrument import Gaussian, Instrument, Sensor
@@ -19,7 +19,7 @@ from loopcal.measure.kinds.image import (
     project,
     solve_focal_lengths,
 )
-from loopcal.measure.simulation import simulate
+from loopcal.measure.simulation import sample_truth, simulate
 
 LENS_VALUES = np.array([3000.0, 3100.0, 2000.0, 1500.0, 0.1, -0.2, 0.05, 0.001, -0.002])
 BOARD = np.array([[0.02 * (i % 9), 0.02 * (i // 9), 0.0] for i in range(54)])
@@ -190,6 +190,40 @@ def test_file_of_two_cameras_assigns_rows_by_the_columns_camera_and_board(tmp_pa
     path.write_text(named.replace(",19,", ",20,"))
     with pytest.raises(LoopcalError, match="has the corner 20, but the corners of the board are 0"):
         load_measurements(path, robot)
+
+
+@pytest.mark.slow
+def test_two_cameras_with_one_lens_and_a_board_each_calibrate_a_machine(tmp_path) -> None:
+    """A sheet with two kinds, from simulated pictures to parameters, frames and the shared lens."""
+    robot = load_robot("hexapod-42")
+    truth = robot.with_values(sample_truth(robot, 1, 4)[0])
+    tilt = geometry.make_pose(geometry.exp_so3(np.array([0.5, 0.0, 0.0])), np.zeros(3))
+    side = geometry.make_pose(np.eye(3), np.array([0.0, 0.0, 0.2])) @ tilt @ look_down(0.5)
+    lower = geometry.make_pose(np.diag([1.0, -1.0, -1.0]), np.array([-0.02, 0.05, 0.02]))
+    boards = {
+        "front": {"board": "plate"},
+        "side": {"board": "tile", "T_camera": side, "T_board": lower},
+    }
+    unknown = ("camera", "board", "focal", "center")
+    kinds = [make_kind(camera=n, lens="phone", unknown=unknown, **of) for n, of in boards.items()]
+    sensors = tuple(Sensor(kind, Gaussian(np.full(2, 0.1))) for kind in kinds)
+    save_measurements(
+        simulate(truth, make_poses(24), Instrument(sensors), 0), path := tmp_path / "d.csv", robot
+    )
+    fit = identify(robot, load_measurements(path, robot))
+    assert fit.converged
+    assert fit.residual_test.chi_square / fit.residual_test.degrees == pytest.approx(1.0, abs=0.1)
+    names = [f"{name}.x" for name in ("front", "side", "plate", "tile")]
+    assert {*names, "phone.fx", "phone.cy"} <= set(fit.nuisance.names)
+    assert not {"front.fx", "side.fx"} & set(fit.nuisance.names)
+    place = fit.nuisance.names.index("phone.fx")
+    assert abs(fit.nuisance.estimate[place] - 4000.0) < 4.0 * fit.nuisance.sd[place]
+    error = (fit.robot.values - truth.values)[robot.parameters.free]
+    sd = np.sqrt(np.diag(fit.covariance))
+    assert np.abs(error / sd).max() < 4.5  # of 42 parameters
+    tolerance = fit.free_parameters.tolerance
+    left = np.linalg.eigvalsh(fit.covariance / np.outer(tolerance, tolerance))
+    assert left[3] < 0.1  # of the variance: pictures determine four combinations well
 
 
 def test_lens_may_hold_in_all_sessions(tmp_path) -> None:
