@@ -34,14 +34,15 @@ from loopcal.measure.readings import (
     select_joint_values,
     solve_commanded_poses,
 )
-from loopcal.mechanism.actuation import solve_at_pose
+from loopcal.mechanism.actuation import list_open_sums, solve_at_pose
 from loopcal.mechanism.assembly import FORCES
-from loopcal.mechanism.kinematics import forward_trials, load_readings
+from loopcal.mechanism.chains import each_stage, join_stage_states
+from loopcal.mechanism.kinematics import Loops, compute_readings, forward_trials, load_readings
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.over_constraint import refuse_breaking_parameters
 from loopcal.mechanism.platform_coordinates import POSITION, read_coordinates
 from loopcal.mechanism.solutions import forward, inverse
-from loopcal.mechanism.states import Status
+from loopcal.mechanism.states import Status, driven_values
 from loopcal.numerics.trial_batch import map_arrays
 from loopcal.typing import BoolArray, FloatArray
 
@@ -85,24 +86,49 @@ def reach_poses(
         true = np.broadcast_to(true, (*shape, readings.shape[1]))
         true = true.reshape(-1, 1, readings.shape[1])
         start = _reshape_state(start, shape, (-1, 1))
-    state = forward_trials(robot, values, true, start)
-    # Redundant actuators of a wrong geometry contradict each other: their true readings are those
-    # of the reached pose. Where they contradict each other so widely that they lead to none, the
-    # machine is moved to the commanded pose, with all but the needed actuators following it.
-    if robot.redundancy is not None:
-        lost = state.status != Status.CONVERGED
-
-        def select(placed: np.ndarray, reached: np.ndarray) -> np.ndarray:
-            mask = lost.reshape(*lost.shape, *[1] * (reached.ndim - 2))
-            return np.where(mask, placed, reached)
-
-        begin = replace(state, T=select(start.T, state.T))
-        placed, closed = solve_at_pose(robot, values, begin.T, begin)
-        state = map_arrays(select, placed, state)
-        true = np.where(np.isfinite(closed), closed, true)
+    true, state = _close_redundant(robot, values, true, start)
     if disturbance.values is not None:
         true, state = true.reshape(*shape, -1), _reshape_state(state, (len(values), 1), shape)
     return true, state
+
+
+def _close_redundant(
+    robot: Mechanism, values: FloatArray, readings: FloatArray, start: State
+) -> tuple[FloatArray, State]:
+    """Return readings (t | 1, n, a), redundant ones as the machines have them, and the states that
+    they lead to from a start.
+
+    Redundant actuators of a wrong geometry contradict each other: their true readings are those of
+    the reached pose. Where they contradict each other so widely that they lead to none, the machine
+    is moved to the commanded pose, with all but the needed actuators following it.
+    """
+    if robot.has_redundant_readings and robot.stages:
+        a, parts = len(robot.actuators), each_stage(robot, values, start, readings)
+        closed = [_close_redundant(p.stage.robot, p.values, p.readings, p.state) for p in parts]
+        counts = [len(stage.robot.actuators) for stage in robot.stages]
+        own = [q[..., :count] for (q, _), count in zip(closed, counts, strict=True)]
+        own.append(readings[..., a:])  # directions of approach
+        lead = np.broadcast_shapes(*(q.shape[:2] for q in own))
+        whole = np.concatenate([np.broadcast_to(q, (*lead, q.shape[2])) for q in own], axis=2)
+        return whole, join_stage_states(robot, [state for _, state in closed])
+    state = forward_trials(robot, values, readings, start)
+    if not robot.has_redundant_readings:
+        return readings, state
+    if robot.redundancy is None:
+        exact, (e, _) = robot.exact, robot.slots(values)
+        sums = list_open_sums(robot, values, robot.determining_readings)
+        own = sums.join(sums.read(driven_values(robot.program, state)))
+        closed = Loops(exact, e, sums.weights).solve(own, state)
+        return compute_readings(exact, values, closed), closed
+    lost = state.status != Status.CONVERGED
+
+    def select(placed: np.ndarray, reached: np.ndarray) -> np.ndarray:
+        mask = lost.reshape(*lost.shape, *[1] * (reached.ndim - 2))
+        return np.where(mask, placed, reached)
+
+    begin = replace(state, T=select(start.T, state.T))
+    placed, closed = solve_at_pose(robot, values, begin.T, begin)
+    return np.where(np.isfinite(closed), closed, readings), map_arrays(select, placed, state)
 
 
 def _reshape_state(state: State, shape: tuple[int, int], wanted: tuple[int, int]) -> State:
@@ -409,7 +435,7 @@ def replace_measured_values(
     filled = replace(
         data, observations=measured.observations, base_observations=measured.base_observations
     )
-    if robot.redundancy is None:
+    if not robot.has_redundant_readings:
         return filled
     # redundant actuators of the true machine cannot all have the readings of the controller
     return replace(filled, readings=measured.readings, reading_sigma=measured.reading_sigma)
@@ -424,7 +450,7 @@ def _record_readings(
     given = None if sigma is None else broadcast_reading_sigma(sigma, true[0])
     resolved = resolve_reading_sigma(robot, given, true.shape[1])
     if resolved is None:
-        return None, given
+        return (true if robot.has_redundant_readings else None), given
     streams = (make_random_stream(seed, trial, READING) for trial in range(trials))
     draws = np.stack([stream.standard_normal(resolved.shape) for stream in streams])
     present = np.isfinite(resolved)

@@ -82,8 +82,12 @@ class OpenSums:
 
     def complete(self, u: FloatArray) -> FloatArray:
         """Return all sums (t, n, r) of values of all readings (t, n, a)."""
-        fixed = np.broadcast_to(self.fixed, (*u.shape[:2], self.fixed.shape[2]))
-        return np.concatenate([u[..., self.places], fixed], axis=2)
+        return self.join(u[..., self.places])
+
+    def join(self, chosen: FloatArray) -> FloatArray:
+        """Return all sums (t, n, r) of those of commanded readings."""
+        fixed = np.broadcast_to(self.fixed, (*chosen.shape[:2], self.fixed.shape[2]))
+        return np.concatenate([chosen, fixed], axis=2)
 
     def read(self, joints: FloatArray) -> FloatArray:
         """Return the sums (t, n, chosen) of joint values (t, n, J)."""

@@ -17,11 +17,9 @@ from loopcal.findings.wording import name_count
 from loopcal.mechanism.actuation import list_open_sums, stack_sum_rows
 from loopcal.mechanism.assembly import AXES, BASE, PLATFORM, Address, Assembly, AttachedStage, Limb
 from loopcal.mechanism.chains import find_carrying_actuators, join_stage_states, locate_stage_bases
-from loopcal.mechanism.inverse import inverse_trials
+from loopcal.mechanism.inverse import close_with_free_actuators, inverse_trials
 from loopcal.mechanism.kinematics import (
-    Loops,
     compute_closure_sign,
-    compute_limb_frames,
     compute_readings,
     forward_trials,
     solve_serial,
@@ -109,6 +107,7 @@ def _find_single_values(robot: Mechanism, values: FloatArray) -> Iterator[tuple[
         yield p.name, report_finding(code, name=p.name, **shown)
 
 
+LESS = 1e-3  # weight of rods, which have no start, among drives that are chosen to be held
 STARTS = 4  # disturbed starts from which home is tried where it is not found
 # Characteristic length [m] of a mechanism whose lengths are all zero (a spherical one).
 DEFAULT_SIZE = 1.0
@@ -469,23 +468,16 @@ def _find_home(robot: Mechanism) -> State:
 
 
 def _close_at_start(robot: Mechanism) -> State:
-    """Return the closed state at the `start` of driven joints, those of rods at the guess of home,
-    of a machine with more drives than controlled coordinates.
+    """Return the closed state at the controlled coordinates of the home pose, of a machine with
+    more drives than these, some of which have the `start` of their joints.
     """
     guess, values = robot.home_state, robot.values[None]
-    frames, joints = compute_limb_frames(robot, values, guess), [*map(np.array, guess.joints)]
-    for group, own in zip(robot.program.groups, joints, strict=True):
-        if group.ending == "distance":
-            ends = np.array([frames[limb][0, 0, -2:, :3, 3] for limb in group.limbs])
-            own[..., -1] = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) - group.length
-    loops, start = Loops.place(robot, values), replace(guess, joints=tuple(joints))
-    own = loops.read(start)
-    if robot.assembly.couplings:
-        own = list_open_sums(robot, values).complete(own)
-    state = loops.solve(own, start)
+    held = _choose_readings(robot, guess, still=True)
+    target = read_coordinates(guess.T, robot.controlled)
+    state = close_with_free_actuators(robot, values, target, guess, held=held)
     if state.status[0, 0] != engine.CONVERGED:
         raise MechanismError(_word_open_home(robot, state))
-    return state
+    return replace(state, closure_sign=compute_closure_sign(robot, values, state))
 
 
 def _word_open_home(robot: Mechanism, state: State) -> str:
@@ -583,15 +575,30 @@ def _find_independent_readings(robot: Mechanism) -> IntArray:
     """
     if robot.program.sigma is None and not robot.has_redundant_sums:
         return np.arange(len(robot.actuators))
+    return _choose_readings(robot, robot.home_state)
+
+
+def _choose_readings(robot: Mechanism, state: State, still: bool = False) -> IntArray:
+    """Return the places (k,) of readings that determine all motions at a state (1, 1), or those
+    in which the platform keeps its coordinates (`still`). Joints are preferred to rods.
+    """
     from scipy.linalg import qr
 
     program, sums = robot.program, list_open_sums(robot, robot.values[None])
-    blocks, count = linearize_state(robot, robot.home_state), sums.chosen
+    blocks, count = linearize_state(robot, state), sums.chosen
     rows = stack_sum_rows(program, blocks, sums.weights[:, count:])[0, 0]
+    if still:
+        target = read_coordinates(state.T[0], robot.controlled)
+        _, slope = compare_coordinates(state.T[0], target, robot.controlled, robot.size)
+        own = np.zeros((len(robot.controlled), rows.shape[1]))
+        own[:, : len(program.freedoms)] = slope[0][:, list(program.freedoms)]
+        rows = np.concatenate([rows, own])
     lengths = [robot.twist_scale[f] for _, f in program.unknown_twists] + [*robot.joint_units]
     motions = find_null_space(rows / lengths, RANK)[-program.n_joints :].T
     moved = motions / robot.joint_units @ sums.weights[0, :count].T * robot.drive_units[:count]
-    _, _, order = qr(moved, mode="economic", pivoting=True)
+    rods = {limb.actuator for limb in robot.assembly.limbs}
+    is_rod = [not rods.isdisjoint(a.driven_joints) for a in robot.actuators[:count]]
+    _, _, order = qr(moved * np.where(is_rod, LESS, 1.0), mode="economic", pivoting=True)
     return np.sort(order[: len(moved)])
 
 

@@ -83,19 +83,20 @@ def close_at_coordinates(
         return without_poses(robot.home_state, max(len(values), len(target)))
     if moves_by_drives(robot):
         return _solve_by_drives(robot, values, target, begin, follow)
-    return _close_with_free_actuators(robot, values, target, begin, start, max_iterations)
+    return close_with_free_actuators(robot, values, target, begin, start, max_iterations)
 
 
-def _close_with_free_actuators(
+def close_with_free_actuators(
     robot: Mechanism,
     values: FloatArray,
     target: FloatArray,
     begin: State,
-    start: State | None,
+    start: State | None = None,
     max_iterations: int = ITERATIONS,
+    held: IntArray | None = None,
 ) -> State:
     """Return states (t, n) at controlled coordinates, all actuated joints free, from `start`; those
-    with a shared drive, and coupled ones, stay together.
+    with a shared drive, and coupled ones, stay together, readings at places `held` as they begin.
     """
     (e, _), guess = robot.slots(values), driven_values(robot.program, begin)
     if determine_platform(robot):
@@ -110,9 +111,9 @@ def _close_with_free_actuators(
 
     T = pose_from_coordinates(target, robot.controlled, robot.home) if start is None else start.T
     begin, own, J = replace(begin, T=np.broadcast_to(T, (t, n, 4, 4))), None, robot.program.n_joints
-    if robot.assembly.couplings:
-        sums = list_open_sums(robot, values)
-        own = scale_sums(robot, sums.weights[:, sums.chosen :], sums.fixed)
+    if robot.assembly.couplings or held is not None:
+        sums = list_open_sums(robot, values, np.zeros(0, int) if held is None else held)
+        own = scale_sums(robot, sums.weights, sums.join(sums.read(guess)))
     elif robot.program.shared_drive_count:
         own = engine.Sums(np.zeros((1, 0, J)), np.zeros((1, n, 0)))  # of which none is given
     guess = np.broadcast_to(guess, (t, n, J))
@@ -519,7 +520,7 @@ def _begin(rows: _Rows, first: State) -> _Iterate:
 def _begin_near_targets(rows: _Rows, start: _Iterate, first: State) -> _Iterate:
     """Return the iterates at which rows begin: the proposed ones, or the first."""
     target = rows.target.reshape(*first.T.shape[:2], -1)
-    near = _close_with_free_actuators(rows.robot, rows.values, target, first, first)
+    near = close_with_free_actuators(rows.robot, rows.values, target, first, first)
     good = np.flatnonzero(near.status[:, 0] == CONVERGED)
     if not len(good):
         return start

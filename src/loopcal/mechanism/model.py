@@ -483,6 +483,11 @@ class Mechanism(DrawnResult):
         return tuple(s / max(sigma) for s in sigma) if is_determined else None
 
     @cached_property
+    def has_redundant_readings(self) -> bool:
+        """Whether some readings of the robot, or of a stage, determine others."""
+        return any(stage.robot.determining_readings is not None for stage in self.blocks)
+
+    @cached_property
     def all_parameters(self) -> ParameterUnits:
         """All parameters in SI, as columns of derivatives."""
         count = len(self.parameters)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from loopcal.errors import FileError, MechanismError
 from loopcal.estimate.identification import identify
 from loopcal.estimate.options import FitOptions
 from loopcal.estimate.penalties import MAP
@@ -328,3 +329,86 @@ def test_arms_of_a_delta_turn_although_its_platform_does_not(tmp_path: Path) -> 
         elbow = radius[:, None] * axis - np.stack([0 * q[:, i]] * 2 + [0.3 * np.sin(q[:, i])], 1)
         rods = np.linalg.norm(T[:, :3, 3] - elbow, axis=1)
         assert_allclose(rods, 0.8, rtol=0, atol=ATOL)
+
+
+# A table on a trunnion that its motor turns over gears; three of its legs grow.
+TRUNNION = """
+format: 1
+family: stages
+name: trunnion
+units: {length: mm, angle: deg}
+controlled: [x, y, z, roll, pitch, yaw]
+conditions: {temperature.legs: {reference: 20, range: [15, 35]}}
+couplings:
+  grow: {of: length, sum: {table.a.stretch: 1}, condition: temperature.legs, slope: 0.004,
+    unknown: [slope], slopes: {sd: 0.0008}}
+  still: {of: length, sum: {table.b.stretch: 1}}
+  gear: {sum: {motor: 1, trunnion.serial.joint: -50}, unknown: [offset], angle: {sd: 3}}
+stages:
+  - {name: motor, joint: {kind: R, axis: y, stroke: [-1500, 1500], at: [0, 400, 0]}}
+  - {name: trunnion, on: base, joint: {kind: R, axis: x, drive: none, errors: [y, z]}}
+  - name: table
+    mount: {z: 50}
+    family: limbs
+    controlled: [x, y, z, roll, pitch, yaw]
+    home: {z: 260}
+    drives: {q: {reads: length, stroke: [-60, 60], unknown: [offset], length: {sd: 0.1}}}
+    limbs:
+      - name: a
+        copies: &copies {count: 3}
+        chain:
+          - &slide {joint: P, name: slide, at: [200, 40, 0], axis: z, actuated: q1}
+          - {joint: U, name: low}
+          - &stretch {joint: P, name: stretch, axis: z}
+        tip: &tip [0, 0, 300]
+        ending: ball
+        attach: [60, 90, 0]
+      - name: b
+        copies: *copies
+        chain: [{<<: *slide, at: [200, -40, 0], actuated: q2}, {joint: U, name: low}, *stretch]
+        tip: *tip
+        ending: ball
+        attach: [60, -90, 0]
+workspace: {x: [-20, 20], y: [-20, 20], z: [290, 320], roll: [-8, 8], pitch: [-5, 5], yaw: [-5, 5]}
+tolerances: {lengths: {sd: 0.1}}
+"""
+
+
+def test_copied_legs_of_a_stage_grow_on_a_geared_trunnion(tmp_path: Path) -> None:
+    nominal = load(TRUNNION, tmp_path)
+    robot = nominal.with_values(sample_truth(nominal, 1, seed=4)[0])
+    value = dict(zip(robot.parameters.names, robot.values, strict=True))
+    reached = inverse(robot, sample_workspace(nominal, POSES, 3).coordinates)
+    assert reached.converged.all()
+    q = np.array(reached.q)
+    q[:, 7] = np.linspace(15, 35, POSES)
+    T = forward(robot, q).T
+    angle = (q[:, 0] - value["gear.offset"]) / 50
+    c, s, one = np.cos(angle), np.sin(angle), np.ones(POSES)
+    turned = np.stack([one, 0 * c, 0 * c, 0 * c, c, -s, 0 * c, s, c], axis=1).reshape(-1, 3, 3)
+    axis = np.array([0.0, value["trunnion.y"], value["trunnion.z"]])
+    for k, side in (("a", 1), ("b", -1)):
+        for i in range(3):
+            a = 2 * np.pi / 3 * i
+            Rz = np.array([[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1]])
+            column = [x.name for x in robot.actuators].index(f"q{1 if side > 0 else 2}{i + 1}")
+            lift = q[:, column] + value[f"table.q{1 if side > 0 else 2}{i + 1}.offset"] + 0.05
+            foot = np.outer(one, Rz @ [0.2, side * 0.04, 0]) + np.outer(lift, [0, 0, 1])
+            foot = axis + np.einsum("nij,nj->ni", turned, foot)
+            head = T[:, :3, 3] + T[:, :3, :3] @ (Rz @ [0.06, side * 0.09, 0])
+            slope = value[f"grow{i + 1}.slope"] if k == "a" else 0.0
+            length = np.linalg.norm(head - foot, axis=1)
+            assert_allclose(length, 0.3 + slope * (q[:, 7] - 20), rtol=0, atol=ATOL)
+
+
+@pytest.mark.parametrize(
+    ("text", "old", "new", "sentence"),
+    [
+        (WINCHES, "  pay:", "  w:", "coupling 'w' has the name 'w1' of another row"),
+        (PULLEYS, "name: wire, at", "name: tip, at", "'cable1' has two elements 'tip'"),
+    ],
+)
+def test_names_that_mean_two_things_are_refused(tmp_path, text, old, new, sentence) -> None:
+    text = text.replace("of: pulley,", "of: tip,")
+    with pytest.raises((FileError, MechanismError), match=sentence):
+        load(text.replace(old, new), tmp_path)

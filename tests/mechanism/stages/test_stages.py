@@ -687,6 +687,7 @@ couplings:
 """
 )
 SPARE = {"chain": TURNED, "coupled": WARM}
+POSES = Instrument((Sensor(Pose("rotation-vector"), Gaussian(np.repeat(2e-5, 6))),))
 
 
 @pytest.mark.parametrize("name", SPARE)
@@ -703,6 +704,12 @@ def test_a_redundant_leg_and_a_turntable_are_spare_drives(name: str, tmp_path: P
         head = T[:, :3, :3] @ (np.array(attach) / 1e3) + T[:, :3, 3]
         assert_allclose(np.linalg.norm(head - foot, axis=1), length, rtol=0, atol=1e-9)
     assert_allclose(forward(robot, q).T, T, rtol=0, atol=1e-9)
+    other = robot.with_values(sample_truth(robot, 1, seed=1)[0])
+    measured = simulate(
+        other, T[:5], POSES, 1, reading_sigma=0.0
+    ).readings
+    assert np.abs(measured - q[:5]).max() > 1e-6
+    assert forward(other, measured).residual.max() < 1e-12
     check_pose_derivatives(robot, q[None, :2])
     body, state = "column", forward(robot, q[:2]).state
     given = robot, robot.values[None], q[None, :2], state, name_entries(body)
@@ -717,11 +724,10 @@ def test_a_redundant_leg_and_a_turntable_are_spare_drives(name: str, tmp_path: P
 @pytest.mark.parametrize("name", SPARE)
 def test_chains_with_spare_and_redundant_drives_are_as_accurate_as_stated(name, tmp_path):
     robot = load_text(tmp_path, SPARE[name])
-    instrument = Instrument((Sensor(Pose("rotation-vector"), Gaussian(np.repeat(2e-5, 6))),))
     poses, z = sample_workspace(robot, 30, seed=1).coordinates, []
     options = FitOptions(method=MAP(), sigma_uncertainty=0.0)
     for i, truth in enumerate(sample_truth(robot, 20, seed=2)):
-        data = simulate(robot.with_values(truth), poses, instrument, i)
+        data = simulate(robot.with_values(truth), poses, POSES, i)
         fit = identify(robot, data, options=options)
         z.append(np.linalg.solve(np.linalg.cholesky(fit.covariance), fit.estimate - truth))
     assert 0.9 < np.sqrt(np.mean(np.square(z))) < 1.1  # 20 machines of 18 parameters: 1 +- 0.04

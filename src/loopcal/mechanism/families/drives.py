@@ -603,7 +603,7 @@ def place_rows(
     for key, coupling in couplings.items():
         reference, base = _find_reference(key, coupling, conditions), Actuator(key, coupling.GIVEN)
         for name, names in _name_joints(key, coupling, joints, known):
-            if name in coupled or name in stated:
+            if name in coupled or name in stated or name in joints:
                 raise coupling.refuse(key, f"has the name {name!r} of another row. Rename one")
             first = joints[next(iter(names.values()))]
             coupled[name] = PlacedRow(name, coupling, names, first, base, reference)

@@ -83,6 +83,11 @@ class PlacedLimb(NamedTuple):
     def find_element(self, name: str) -> str:
         """Return a link by name; a joint of several axes means its first."""
         for candidate in (name, f"{name}.1", f"{name}.turn"):
+            if self.elements.count(candidate) > 1:
+                raise MechanismError(
+                    f"limb {self.name!r} has two elements {candidate!r}: one is the end of its "
+                    "chain. Rename the joint"
+                )
             if candidate in self.elements:
                 return candidate
         raise MechanismError(
