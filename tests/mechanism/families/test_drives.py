@@ -30,7 +30,7 @@ def write_robot(folder: Path, name: str, drives: str) -> Path:
     text = list_shipped_robots()[robot].read_text()
     kept, skips = list[str](), False
     for line in text.splitlines():
-        skips = line.startswith("actuators:") or (skips and line.startswith(" "))
+        skips = line.startswith("drives:") or (skips and line.startswith(" "))
         kept += [] if skips else ["legs: ups" if change and line == "legs: rod" else line]
     path = folder / "robot.yaml"
     path.write_text("\n".join([*kept, drives]) + "\n")
