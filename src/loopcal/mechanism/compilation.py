@@ -173,12 +173,13 @@ def _close_at_home(
                 value=Quantity(locked.start, SI_SYMBOLS[locked.dimension]),
             )
         )
-    weights = _weigh_actuators(assembly, groups, freedoms, size)
+    program = Program(groups, freedoms, size, count, a, others=others)
+    assembly, program = _weigh_actuators(assembly, program)
     robot = Mechanism(
         assembly,
         table,
         table.nominal,
-        Program(groups, freedoms, size, count, a, weights, others=others),
+        program,
         _map_slots(assembly, table, places, count),
         size,
         guess,
@@ -191,10 +192,10 @@ def _close_at_home(
         joints = driven_values(robot.program, robot.home_state)
         return replace(robot, home_state=solve_serial(robot, e, joints))
     robot = replace(robot, home_state=_find_home(robot))
-    count = _count_freedoms(robot)
-    if has_spare := _has_spare_drives(assembly, count):
+    mobility = _count_freedoms(assembly, program)
+    if has_spare := _has_spare_drives(assembly, mobility):
         refuse_free_bodies(robot, robot.home_state)
-        is_redundant = count < len(assembly.rows) - len(assembly.couplings)
+        is_redundant = mobility < len(assembly.rows) - len(assembly.couplings)
         robot = replace(robot, program=replace(robot.program, may_stay_open=is_redundant))
     else:
         robot = check_mobility(robot)
@@ -340,35 +341,29 @@ def _group_limbs(
     return tuple(groups), places, count
 
 
-def _weigh_actuators(
-    assembly: Assembly, groups: tuple[Group, ...], freedoms: tuple[int, ...], size: float
-) -> tuple[float, ...] | None:
-    """Return relative standard deviations of redundant actuators; else None. The largest, an angle
-    at the robot's size, is 1 m, so that residuals are lengths.
+def _weigh_actuators(assembly: Assembly, program: Program) -> tuple[Assembly, Program]:
+    """Return an assembly and its program that weigh redundant actuators: by relative standard
+    deviations where each limb has one of them and one closure equation, else as sums of one joint.
+    The largest deviation, an angle at the robot's size, is 1 m, so that residuals are lengths.
     """
-    if assembly.couplings or len(assembly.rows) <= len(freedoms):
-        return None
+    freedoms = max(len(program.freedoms), _count_freedoms(assembly, program))
+    if assembly.couplings or len(assembly.rows) <= freedoms:
+        return assembly, program
     sigma = [a.sigma if a.sigma is not None else 1.0 for a in assembly.rows]
     if len({a.sigma is None for a in assembly.rows}) > 1 or min(sigma) <= 0:
         raise MechanismError(
             f"{assembly.name} has more actuators than freedoms. Give a positive sigma for every "
             "actuator, or for none"
         )
-    if any(row.weights for row in assembly.rows):
-        return None  # sigma weighs the sums, whatever the limbs
-    for group in groups:
-        rows = len(group.rows) - len(group.unknown_joints(False))
-        driven = int((group.actuator[:, 0] >= 0).sum())
-        if rows != driven or driven != 1:
-            limb = assembly.limbs[group.limbs[0]].name
-            raise MechanismError(
-                f"{assembly.name} has {len(assembly.rows)} actuators for {len(freedoms)} freedoms, "
-                f"and limb {limb!r} has {driven} of them and {rows} closure equations; redundant "
-                "actuation needs limbs with one of each"
-            )
+    driven = ((group, len(group.driven_joints)) for group in program.groups)
+    is_simple = all(n == 1 == len(g.rows) - len(g.unknown_joints(False)) for g, n in driven)
+    if not is_simple or any(row.weights for row in assembly.rows):
+        rows = (replace(a, weights=a.weights or {a.name: 1.0}) for a in assembly.rows)
+        actuators = (*rows, *assembly.actuators[len(assembly.rows) :])
+        return replace(assembly, actuators=actuators), program
     turns = [a.name in assembly.turning_drives for a in assembly.rows]
-    largest = max(s * (size if turn else 1.0) for s, turn in zip(sigma, turns, strict=True))
-    return tuple(s / largest for s in sigma)
+    largest = max(s * (program.size if t else 1.0) for s, t in zip(sigma, turns, strict=True))
+    return assembly, replace(program, sigma=tuple(s / largest for s in sigma))
 
 
 def _check_compliances(assembly: Assembly, freedoms: tuple[int, ...]) -> None:
@@ -417,13 +412,12 @@ def _make_first_guess(assembly: Assembly, groups: tuple[Group, ...]) -> State:
     return make_start(home, tuple(np.array([[rows]]) for rows in joints), tuple(others))
 
 
-def _count_freedoms(robot: Mechanism) -> int:
-    """Return how many freedoms the machine has with every drive free, of its unknowns less its
+def _count_freedoms(assembly: Assembly, program: Program) -> int:
+    """Return how many freedoms a machine has with every drive free, of its unknowns less its
     equations.
     """
-    program, couplings = robot.program, len(robot.assembly.couplings)
     equations = program.count_equations(free=True) + program.shared_drive_count
-    return len(program.unknown_twists) - equations - couplings
+    return len(program.unknown_twists) - equations - len(assembly.couplings)
 
 
 def _has_spare_drives(assembly: Assembly, freedoms: int) -> bool:
@@ -436,7 +430,7 @@ def _has_spare_drives(assembly: Assembly, freedoms: int) -> bool:
 
 def _find_home(robot: Mechanism) -> State:
     """Return the closed state at the controlled coordinates of the home pose."""
-    values, movable = robot.values[None], _count_freedoms(robot)
+    values, movable = robot.values[None], _count_freedoms(robot.assembly, robot.program)
     shared = robot.program.shared_drive_count + len(robot.assembly.couplings)
     if _has_spare_drives(robot.assembly, movable):
         return _close_at_start(robot)
