@@ -412,3 +412,45 @@ def test_names_that_mean_two_things_are_refused(tmp_path, text, old, new, senten
     text = text.replace("of: pulley,", "of: tip,")
     with pytest.raises((FileError, MechanismError), match=sentence):
         load(text.replace(old, new), tmp_path)
+
+
+# Two arms with two motors each hold a plate, which needs three.
+TWO_ARMS = """
+format: 1
+family: limbs
+name: two-arms
+units: {length: mm, angle: deg}
+freedoms: [x, y, rz]
+controlled: [x, y, yaw]
+drives: {a: {reads: angle, sigma: 0.01, unknown: [offset], angle: {sd: 0.2}}}
+limbs:
+  - name: left
+    ending: rigid
+    chain:
+      - {joint: R, name: s, at: [-200, 0, 0], actuated: a1, start: 100}
+      - {joint: R, name: e, at: [200, 0, 0], actuated: a2, start: -60}
+      - {joint: R, name: p, at: [200, 0, 0], start: -40}
+    attach: [-50, 0, 0]
+  - name: right
+    ending: rigid
+    chain:
+      - {joint: R, name: s, at: [200, 0, 0], actuated: a3, start: 80}
+      - {joint: R, name: e, at: [200, 0, 0], actuated: a4, start: 60}
+      - {joint: R, name: p, at: [200, 0, 0], start: -140}
+    attach: [50, 0, 0]
+home: {y: 310}
+workspace: {x: [-50, 50], y: [290, 340], yaw: [-8, 8]}
+"""
+
+
+def test_two_motors_of_one_limb_may_be_redundant(tmp_path: Path) -> None:
+    robot = load(TWO_ARMS, tmp_path)
+    reached = sample_workspace(robot, POSES, 3).solution
+    x, y = reached.T[:, :2, 3].T
+    yaw = np.arctan2(reached.T[:, 1, 0], reached.T[:, 0, 0])
+    for side, (first, second) in ((-1, reached.q[:, :2].T), (1, reached.q[:, 2:].T)):
+        tip = side * 0.2 + 0.2 * np.exp(1j * first) + 0.2 * np.exp(1j * (first + second))
+        assert_allclose(tip, x + 1j * y + side * 0.05 * np.exp(1j * yaw), rtol=0, atol=ATOL)
+    assert_allclose(forward(robot, reached.q).T, reached.T, rtol=0, atol=ATOL)
+    turned = reached.q + 1e-4 * np.eye(4)[0]  # contradicts the others, which share the error
+    assert 0.0 < np.abs(forward(robot, turned).T - reached.T).max() < 3e-4
