@@ -73,9 +73,13 @@ def reach_poses(
     readings: FloatArray,
     start: State,
     disturbance: Disturbance = NO_DISTURBANCE,
+    are_exact: bool = True,
 ) -> tuple[FloatArray, State]:
     """Return the true readings (t | 1, n, a) and the states (t, n) of t machines of values (t, p)
     [SI], from the readings (n, a) of the controller and the state (1, n) of the commanded poses.
+
+    are_exact : whether the readings of the controller count as exact, although redundant ones that
+        the pose does not determine contradict each other.
     """
     true = readings[None]
     if disturbance.readings is not None:
@@ -86,14 +90,14 @@ def reach_poses(
         true = np.broadcast_to(true, (*shape, readings.shape[1]))
         true = true.reshape(-1, 1, readings.shape[1])
         start = _reshape_state(start, shape, (-1, 1))
-    true, state = _close_redundant(robot, values, true, start)
+    true, state = _close_redundant(robot, values, true, start, are_exact)
     if disturbance.values is not None:
         true, state = true.reshape(*shape, -1), _reshape_state(state, (len(values), 1), shape)
     return true, state
 
 
 def _close_redundant(
-    robot: Mechanism, values: FloatArray, readings: FloatArray, start: State
+    robot: Mechanism, values: FloatArray, readings: FloatArray, start: State, are_exact: bool
 ) -> tuple[FloatArray, State]:
     """Return readings (t | 1, n, a), redundant ones as the machines have them, and the states that
     they lead to from a start.
@@ -104,7 +108,9 @@ def _close_redundant(
     """
     if robot.has_redundant_readings and robot.stages:
         a, parts = len(robot.actuators), each_stage(robot, values, start, readings)
-        closed = [_close_redundant(p.stage.robot, p.values, p.readings, p.state) for p in parts]
+        closed = [
+            _close_redundant(p.stage.robot, p.values, p.readings, p.state, are_exact) for p in parts
+        ]
         counts = [len(stage.robot.actuators) for stage in robot.stages]
         own = [q[..., :count] for (q, _), count in zip(closed, counts, strict=True)]
         own.append(readings[..., a:])  # directions of approach
@@ -112,7 +118,7 @@ def _close_redundant(
         whole = np.concatenate([np.broadcast_to(q, (*lead, q.shape[2])) for q in own], axis=2)
         return whole, join_stage_states(robot, [state for _, state in closed])
     state = forward_trials(robot, values, readings, start)
-    if not robot.has_redundant_readings:
+    if not robot.has_redundant_readings or (robot.redundancy is None and are_exact):
         return readings, state
     if robot.redundancy is None:
         exact, (e, _) = robot.exact, robot.slots(values)
@@ -291,7 +297,10 @@ def simulate_trials(
     nuisance = nuisance.with_nominal(nuisance.values(nuisance_values))
     true_setup = _draw_setup(nuisance, nuisance_values or {}, len(values), seed)
     # Starting at the commanded pose keeps the true machine in the assembly mode of its controller.
-    true, state = reach_poses(robot, values, readings, commanded.state, disturbance)
+    true, state = reach_poses(
+        *(robot, values, readings, commanded.state, disturbance),
+        are_exact=resolve_reading_sigma(robot, given, n) is None,
+    )
     T = np.broadcast_to(state.T, (len(values), *state.T.shape[1:]))
     reached = np.array(np.broadcast_to(state.status == Status.CONVERGED, T.shape[:2]))
     joints = select_joint_values(
@@ -450,7 +459,7 @@ def _record_readings(
     given = None if sigma is None else broadcast_reading_sigma(sigma, true[0])
     resolved = resolve_reading_sigma(robot, given, true.shape[1])
     if resolved is None:
-        return (true if robot.has_redundant_readings else None), given
+        return None, given
     streams = (make_random_stream(seed, trial, READING) for trial in range(trials))
     draws = np.stack([stream.standard_normal(resolved.shape) for stream in streams])
     present = np.isfinite(resolved)
