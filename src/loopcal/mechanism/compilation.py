@@ -42,13 +42,7 @@ from loopcal.mechanism.over_constraint import report_over_constraint
 from loopcal.mechanism.platform_coordinates import compare_coordinates, read_coordinates
 from loopcal.mechanism.sensitivity import differentiate_pose
 from loopcal.mechanism.states import driven_values, is_closed, make_start
-from loopcal.mechanism.transmission import (
-    LOAD,
-    list_constants,
-    name_terms,
-    nominal_terms,
-    readings_from_joints,
-)
+from loopcal.mechanism.transmission import LOAD, list_constants, name_terms, nominal_terms
 from loopcal.numerics.decomposition import find_null_space
 from loopcal.parameters import ParameterTable
 from loopcal.typing import FloatArray, IntArray
@@ -69,8 +63,7 @@ def find_impossible_values(
         target = read_coordinates(robot.home_state.T, robot.controlled)
         state = inverse_trials(robot, values[None], target)
     else:  # at the readings of the nominal home, where nominal values displace nothing
-        joints, slots = driven_values(robot.program, robot.home_state), robot.slots
-        q = readings_from_joints(joints, slots.terms[None], slots.constants)
+        q = compute_readings(robot, robot.parameters.nominal[None], robot.home_state)
         state = forward_trials(robot, values[None], q)
     if is_closed(state.status).all():
         return ()

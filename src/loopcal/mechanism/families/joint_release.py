@@ -31,7 +31,7 @@ from loopcal.mechanism.families.limbs import (
     axis_vector,
 )
 from loopcal.mechanism.families.placement import frame_from_axis
-from loopcal.mechanism.kinematics import compute_limb_frames, forward_trials
+from loopcal.mechanism.kinematics import compute_limb_frames, compute_readings, forward_trials
 from loopcal.mechanism.limb_rows import move_joint
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.over_constraint import (
@@ -39,8 +39,7 @@ from loopcal.mechanism.over_constraint import (
     find_self_stress,
     is_over_constrained,
 )
-from loopcal.mechanism.states import Status, driven_values, list_bodies
-from loopcal.mechanism.transmission import readings_from_joints
+from loopcal.mechanism.states import Status, list_bodies
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension
 
@@ -189,9 +188,7 @@ def _is_verified(robot: Mechanism, record: Limbs, chosen: list[AddedJoint]) -> b
     assumed = DEFAULT_ERROR * np.where(is_length, freer.size, 1.0)
     sd = np.where(np.isnan(table.tolerance), assumed, table.tolerance)
     values = table.nominal + sd * rng.standard_normal((2, len(table)))
-    joints = driven_values(robot.program, find_nearby_states(robot))
-    slots = robot.slots
-    q = readings_from_joints(joints, slots.terms[None], slots.constants)
+    q = compute_readings(robot, robot.parameters.nominal[None], find_nearby_states(robot))
     state = forward_trials(freer, values, q, follow=False)
     return bool((state.status == Status.CONVERGED.value).all())
 
