@@ -246,6 +246,11 @@ class Stage:
     groups: slice
 
 
+def describe_gap(gap: float, scale: float) -> Quantity:
+    """Return a gap of loops [m], with a `Mechanism.gap_scale` above 0 as an angle."""
+    return Quantity(gap / scale, "rad") if scale else Quantity(gap * 1e3, "mm")
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class Mechanism(DrawnResult):
     """A robot with closed loops, ready to compute.
@@ -342,11 +347,15 @@ class Mechanism(DrawnResult):
         unit = self.get_unit(dimension)
         return Quantity(value / unit.factor_to_si, unit.symbol)
 
+    @property
+    def gap_scale(self) -> float:
+        """The size [m] by which gaps of loops are angles, of bodies that only rotate; else 0."""
+        only_rotates = all(freedom < 3 for own in self.program.nodes for freedom in own)
+        return self.size if only_rotates else 0.0
+
     def describe_gap(self, gap: float) -> Quantity:
-        """Return the gap [m] of loops; of bodies that only rotate it is an angle times the size."""
-        if all(freedom < 3 for freedoms in self.program.nodes for freedom in freedoms):
-            return self.to_quantity(gap / self.size, Dimension.ANGLE)
-        return Quantity(gap * 1e3, "mm")
+        """Return the gap [m] of loops as a length or an angle."""
+        return describe_gap(gap, self.gap_scale)
 
     @property
     def stated_sigma(self) -> FloatArray:

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from loopcal import engine, geometry
 from loopcal.engine import NEAR_GOAL, State
 from loopcal.errors import DataError
-from loopcal.findings import Finding, Quantity, report_finding
+from loopcal.findings import Finding, report_finding
 from loopcal.mechanism.assembly import AXES, TWIST_UNITS
 from loopcal.mechanism.chains import split_stage_states
 from loopcal.mechanism.inverse import (
@@ -37,7 +37,7 @@ from loopcal.mechanism.kinematics import (
     load_readings,
 )
 from loopcal.mechanism.limb_rows import name_passive_joints
-from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.model import Mechanism, describe_gap
 from loopcal.mechanism.platform_coordinates import (
     POSITION,
     compare_coordinates,
@@ -333,7 +333,7 @@ class Solution(TableResult):
     T : (n, 4, 4) platform in base [m]. q : (n, a) readings [m or rad].
     passive : (n, j) passive joint values, limb by limb [m or rad]; `passive_names` names them.
     status : (n,) members of Status. residual : (n,) closure residual [m]. iterations : (n,) Newton
-        steps. state : the same rows for the engine.
+        steps. state : the same rows for the engine. gap_scale : that of the robot.
     """
 
     T: FloatArray
@@ -344,6 +344,7 @@ class Solution(TableResult):
     residual: FloatArray
     iterations: IntArray
     state: State
+    gap_scale: float = 0.0
 
     FIELDS: ClassVar[tuple[Field, ...]] = (
         Field(
@@ -366,7 +367,7 @@ class Solution(TableResult):
         gap = self.residual[self.converged].max(initial=0.0)
         text = f"<Solution: {len(self) - len(failed)} of {len(self)} rows closed"
         if len(failed) < len(self):
-            text += f", residual at most {Quantity(float(gap) * 1e3, 'mm')}"
+            text += f", residual at most {describe_gap(float(gap), self.gap_scale)}"
         if len(failed):
             text += f"; row {failed[0]}: {self.explain(int(failed[0]))}"
         return text + ">"
@@ -398,7 +399,10 @@ class Solution(TableResult):
         elif status == Status.NOT_CONVERGED and gap <= COMPROMISE:
             code = "kinematics.not-nearest"
         return report_finding(
-            code, row=row, gap=Quantity(gap * 1e3, "mm"), iterations=int(self.iterations[row])
+            code,
+            row=row,
+            gap=describe_gap(gap, self.gap_scale),
+            iterations=int(self.iterations[row]),
         )
 
 
@@ -511,6 +515,7 @@ def make_solution(robot: Mechanism, state: State, q: FloatArray) -> Solution:
         state.residual[0],
         state.iterations[0],
         state,
+        robot.gap_scale,
     )
 
 

@@ -462,3 +462,28 @@ def test_two_motors_of_one_limb_may_be_redundant(tmp_path: Path) -> None:
     assert_allclose(forward(robot, reached.q).T, reached.T, rtol=0, atol=ATOL)
     turned = reached.q + 1e-4 * np.eye(4)[0]  # contradicts the others, which share the error
     assert 0.0 < np.abs(forward(robot, turned).T - reached.T).max() < 3e-4
+
+
+def test_gaps_of_a_spherical_machine_are_angles(tmp_path: Path) -> None:
+    text = """
+format: 1
+family: limbs
+name: wrist
+units: {length: mm, angle: deg}
+freedoms: [rx, ry, rz]
+controlled: [roll, pitch, yaw]
+drives: {m: {reads: angle, sigma: 0.01, unknown: [offset], angle: {sd: 0.2}}}
+limbs:
+  - name: crank
+    copies: {count: 4, about: z}
+    ending: rigid
+    chain:
+      - {joint: R, name: motor, axis: [1, 0, -0.4], actuated: m}
+      - {joint: R, name: elbow, axis: [0, 1, 0.2]}
+      - {joint: R, name: pin, axis: [0.3, 0, 1]}
+"""
+    robot = load(text, tmp_path)
+    solution = forward(robot, 1e-3 * np.array([[1.0, -1.0, 1.0, -1.0]]))  # contradict each other
+    assert_allclose(solution.residual, 2e-3 * robot.size, rtol=1e-3)  # four times a mrad
+    assert "mrad" in repr(solution)
+    assert "mrad" in str(robot.describe_gap(solution.residual[0]))
