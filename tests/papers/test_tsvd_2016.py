@@ -481,9 +481,8 @@ def make_true(claim: str, draws: list[tuple[steps.Sweep, ...]], is_true: np.ndar
                     chosen[steps.TSVD].iterations[:] = np.where(is_true, 5, 20)
                 case "lambda_range":
                     best = np.where(is_true, 1e-4 if number else 1e-1, 10.0)
-                    chosen[steps.RE].settings[:] = best
-                    places = np.argmin(abs(sweep.settings[steps.RE][1:] - best[:, None]), axis=1)
-                    sweep.curves[steps.EARLY][np.arange(len(best)), 1 + places] = 0.5
+                    for algorithm in (steps.RE, steps.EARLY):
+                        chosen[algorithm].settings[:] = best
                 case "k_near_j":
                     curve[np.arange(len(low)), np.where(is_true, 1, -1)] = 0.5
                 case "no_rule":

@@ -664,13 +664,10 @@ def _judge_lambda(results: Results) -> published.Verdict:
     the whole iteration and after the short one, which must not contradict each other.
     """
     smallest, largest = (steps.PRINTED.number("lambda", end) for end in ("smallest", "largest"))
-    converged = {label: sweep.chosen[RE].settings for label, sweep in results.sweeps.items()}
-    early = {
-        label: sweep.settings[RE][1:][
-            steps.locate_bottoms(sweep.curves[EARLY][:, 1:], (0, 1))[:, -1]
-        ]
-        for label, sweep in results.sweeps.items()
-    }
+    converged, early = (
+        {label: sweep.chosen[algorithm].settings for label, sweep in results.sweeps.items()}
+        for algorithm in (RE, EARLY)
+    )
     held = []
     for best in (converged, early):
         values = np.array(list(best.values()))
