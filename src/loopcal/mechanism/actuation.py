@@ -201,7 +201,8 @@ def measure_sums(robot: Mechanism, weights: FloatArray) -> FloatArray:
     """
     with np.errstate(divide="ignore"):
         lengths = (1.0 / (np.abs(weights[0]) / robot.joint_units).max(axis=1)).clip(max=1e12)
-    readings = np.array([row.column is None for row in robot.assembly.rows[-len(lengths) :]])
+    last = robot.assembly.rows[len(robot.assembly.rows) - len(lengths) :]
+    readings = np.array([row.column is None for row in last])
     if robot.has_redundant_sums and readings.any():
         rows = [row for row in robot.assembly.rows if row.column is None]
         sigma = [(row.sigma or 0.0) * abs(row.terms.get("gain", 1.0)) for row in rows]

@@ -192,7 +192,10 @@ def _close_at_home(
         robot = replace(robot, program=replace(robot.program, may_stay_open=is_redundant))
     else:
         robot = check_mobility(robot)
-    robot = replace(robot, independent=_find_independent_readings(robot))
+    independent = np.arange(len(robot.actuators))
+    if robot.program.sigma is not None or robot.has_redundant_sums:
+        independent = _choose_readings(robot, robot.home_state)
+    robot = replace(robot, independent=independent)
     if has_spare:
         _check_drives_of_pose(robot)
     return robot
@@ -422,12 +425,13 @@ def _has_spare_drives(assembly: Assembly, freedoms: int) -> bool:
 
 
 def _find_home(robot: Mechanism) -> State:
-    """Return the closed state at the controlled coordinates of the home pose."""
+    """Return the closed state at the controlled coordinates of the home pose. With more drives than
+    these, some have the `start` of their joints.
+    """
     values, movable = robot.values[None], _count_freedoms(robot.assembly, robot.program)
     shared = robot.program.shared_drive_count + len(robot.assembly.couplings)
-    if _has_spare_drives(robot.assembly, movable):
-        return _close_at_start(robot)
-    if len(robot.controlled) < movable:
+    has_spare = _has_spare_drives(robot.assembly, movable)
+    if len(robot.controlled) < movable and not has_spare:
         raise MechanismError(
             f"{robot.name} moves in {movable} freedoms or more, but names only "
             f"{len(robot.controlled)} controlled coordinates "
@@ -435,7 +439,11 @@ def _find_home(robot: Mechanism) -> State:
             f"`freedoms:`"
         )
     target = read_coordinates(robot.assembly.home[None, None], robot.controlled)
-    state = inverse_trials(robot, values, target)
+    if has_spare:
+        held = _choose_readings(robot, robot.home_state, still=True)
+        state = close_with_free_actuators(robot, values, target, robot.home_state, held=held)
+    else:
+        state = inverse_trials(robot, values, target)
     if state.status[0, 0] != engine.CONVERGED:
         if robot.assembly.couplings and movable < len(robot.controlled):
             raise MechanismError(
@@ -448,32 +456,14 @@ def _find_home(robot: Mechanism) -> State:
         if not shared:
             refuse_uncontrolled(robot, robot.home_state)
         refuse_singular_home(robot, state)
-        raise MechanismError(_word_open_home(robot, state))
-    if shared:
+        gap = robot.describe_gap(float(state.residual[0, 0]))
+        raise MechanismError(
+            f"the loops of {robot.name} do not close at its home pose: {gap} stay open. Check the "
+            "joint centers, the lengths and `home:`"
+        )
+    if shared or has_spare:
         return replace(state, closure_sign=compute_closure_sign(robot, values, state))
     return state
-
-
-def _close_at_start(robot: Mechanism) -> State:
-    """Return the closed state at the controlled coordinates of the home pose, of a machine with
-    more drives than these, some of which have the `start` of their joints.
-    """
-    guess, values = robot.home_state, robot.values[None]
-    held = _choose_readings(robot, guess, still=True)
-    target = read_coordinates(guess.T, robot.controlled)
-    state = close_with_free_actuators(robot, values, target, guess, held=held)
-    if state.status[0, 0] != engine.CONVERGED:
-        raise MechanismError(_word_open_home(robot, state))
-    return replace(state, closure_sign=compute_closure_sign(robot, values, state))
-
-
-def _word_open_home(robot: Mechanism, state: State) -> str:
-    """Return the sentence for loops that do not close at home."""
-    gap = robot.describe_gap(float(state.residual[0, 0]))
-    return (
-        f"the loops of {robot.name} do not close at its home pose: {gap} stay open. Check the "
-        "joint centers, the lengths and `home:`"
-    )
 
 
 def _refuse_singular_start(robot: Mechanism, target: FloatArray) -> None:
@@ -554,15 +544,6 @@ def _build_stages(attached: Sequence[AttachedStage]) -> tuple[Stage, ...]:
         places[stage.name] = len(stages) - 1
         p, a, g = (i + n for i, n in zip((p, a, g), counts, strict=True))
     return tuple(stages)
-
-
-def _find_independent_readings(robot: Mechanism) -> IntArray:
-    """Return the places (k,) of readings that determine all redundant ones at home, of other robots
-    all places.
-    """
-    if robot.program.sigma is None and not robot.has_redundant_sums:
-        return np.arange(len(robot.actuators))
-    return _choose_readings(robot, robot.home_state)
 
 
 def _choose_readings(robot: Mechanism, state: State, still: bool = False) -> IntArray:

@@ -110,13 +110,11 @@ def close_with_free_actuators(
         return compare_coordinates(T, flat[rows], robot.controlled, robot.size)
 
     T = pose_from_coordinates(target, robot.controlled, robot.home) if start is None else start.T
-    begin, own, J = replace(begin, T=np.broadcast_to(T, (t, n, 4, 4))), None, robot.program.n_joints
-    if robot.assembly.couplings or held is not None:
+    begin, own = replace(begin, T=np.broadcast_to(T, (t, n, 4, 4))), None
+    if robot.assembly.couplings or robot.program.shared_drive_count or held is not None:
         sums = list_open_sums(robot, values, np.zeros(0, int) if held is None else held)
         own = scale_sums(robot, sums.weights, sums.join(sums.read(guess)))
-    elif robot.program.shared_drive_count:
-        own = engine.Sums(np.zeros((1, 0, J)), np.zeros((1, n, 0)))  # of which none is given
-    guess = np.broadcast_to(guess, (t, n, J))
+    guess = np.broadcast_to(guess, (t, n, robot.program.n_joints))
     given = begin, command, own is None, max_iterations
     return engine.solve(robot.program, e, guess, *given, sums=own)
 
