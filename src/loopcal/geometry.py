@@ -19,7 +19,7 @@ import numpy as np
 from loopcal.errors import DataError
 from loopcal.numerics.decomposition import are_nonzero
 from loopcal.numerics.elimination import shorten_rows
-from loopcal.typing import FloatArray
+from loopcal.typing import FloatArray, IntArray
 from loopcal.units import Dimension
 
 # Added to squared lengths before the square root: far below any square that matters, far above the
@@ -670,7 +670,7 @@ def _find_newton_step(H: FloatArray, g: FloatArray, R: FloatArray) -> FloatArray
     """
     slope = (R.reshape(-1, 1, 9) @ H)[:, 0] - g
     first = (GENERATORS @ R[:, None]).reshape(-1, 3, 9)
-    # generators i and j of the second derivatives have the product e_j e_i' - e_i'e_j
+    # the product of generators i and j is e_j e_i' - (i = j), that of the second derivatives
     bend = slope.reshape(-1, 3, 3) @ np.swapaxes(R, 1, 2)
     bend = (
         0.5 * (bend + np.swapaxes(bend, 1, 2))
@@ -730,10 +730,10 @@ def solve_hand_eye(
 
 def solve_frame_and_points(
     measured: FloatArray, moving: FloatArray, constant: FloatArray
-) -> list[tuple[FloatArray, FloatArray]]:
-    """Return for each of s sets candidates of a frame (k, 4, 4) and of the coordinates p (k, w) of
-    points on a moving body with `R measured + t = moving p + constant`, for measured (s, q, 3), NaN
-    where missing, moving (s, q, 3, w) and constant (s, q, 3).
+) -> tuple[FloatArray, FloatArray, IntArray]:
+    """Return candidates of a frame (k, 4, 4) and of the coordinates p (k, w) of points on a moving
+    body with `R measured + t = moving p + constant`, for s sets of measured (s, q, 3), NaN where
+    missing, moving (s, q, 3, w) and constant (s, q, 3); and the set (k,) of each, in order.
 
     For a given rotation R the other unknowns enter linearly. Eliminating them leaves a quadratic
     form of R.
@@ -753,13 +753,12 @@ def solve_frame_and_points(
     Q = Q * used
     out = both - Q @ (np.swapaxes(Q, 1, 2) @ both)
     form = np.swapaxes(out[..., :9], 1, 2) @ out
-    solutions = []
     rotations = minimize_over_rotations(form[..., :9], form[..., 9])
+    of, R = np.repeat(np.arange(s), [len(each) for each in rotations]), np.concatenate(rotations)
     inverse = np.swapaxes(V, 1, 2) / np.where(used, size[:, None, :], np.inf)
-    for j, R in enumerate(rotations):
-        rest = (inverse[j] @ (Q[j].T @ (M[j] @ R.reshape(-1, 9).T - b[j]))).T
-        solutions.append((make_pose(R, rest[:, w:]), rest[:, :w]))
-    return solutions
+    left = np.swapaxes(Q, 1, 2)[of] @ (M[of] @ R.reshape(-1, 9, 1) - b[of])
+    rest = (inverse[of] @ left)[..., 0]
+    return make_pose(R, rest[:, w:]), rest[:, :w], of
 
 
 def solve_resection(rays: FloatArray, points: FloatArray) -> FloatArray:

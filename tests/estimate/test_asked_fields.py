@@ -78,7 +78,8 @@ def test_no_result_depends_on_the_order_of_asking(fit):
             np.testing.assert_array_equal(found[name], array, err_msg=name)
 
 
-def test_a_field_is_computed_when_asked_for_and_once(monkeypatch):
+@pytest.mark.parametrize("make", FITS[:2])
+def test_a_field_is_computed_when_asked_for_and_once(monkeypatch, make):
     asked = []
 
     def count(name):
@@ -89,7 +90,7 @@ def test_a_field_is_computed_when_asked_for_and_once(monkeypatch):
 
     for name in ("label_residuals", "describe_null_space", "describe_frames", "report_noise"):
         count(name)
-    fit = fit_least_squares()
+    fit = make()
     assert fit.converged
     assert np.isfinite(fit.estimate).all()
     assert np.isfinite(fit.covariance).all()

@@ -393,12 +393,10 @@ def add_factor_uncertainty(result: Identification, fit: Descent) -> Identificati
     source: dict[str, Any] = {"source": "given or assumed"} if method.held else {}
     finding = report_finding(INFLATION, factor=factor, parts=component_rows, **source)
     change = np.stack([error[0] for error in errors], axis=1)
-    inflated = add_covariance(result, scale * change, np.inf, finding)
     uncertain = [
         CovariancePart(TOLERANCES, scale * caused, 0.5 / spread**2) for _, caused, spread in errors
     ]
-    posterior = inflated.posterior
-    return replace(inflated, posterior=replace(posterior, parts=(*posterior.parts, *uncertain)))
+    return add_covariance(result, scale * change, np.inf, finding, uncertain)
 
 
 _FactorError = tuple[FloatArray, FloatArray, float]

@@ -45,7 +45,7 @@ from loopcal.mechanism.model import Mechanism
 from loopcal.numerics.decomposition import Decomposition, are_nonzero
 from loopcal.numerics.gauss_newton import DescentStatus
 from loopcal.parameters import ParameterTable
-from loopcal.results.deferred import DeferredFields, deferred
+from loopcal.results.deferred import DeferredFields, deferred, later
 from loopcal.results.description import OTHER, Field, Source, fields, label_axes
 from loopcal.results.presenters import draw
 from loopcal.results.result import TableResult
@@ -609,7 +609,11 @@ class FitFigures:
 
 
 def add_covariance(
-    fit: Identification, root: FloatArray, degrees: float, finding: Finding
+    fit: Identification,
+    root: FloatArray,
+    degrees: float,
+    finding: Finding,
+    uncertain: Sequence[CovariancePart] = (),
 ) -> Identification:
     """Return a fit whose parameters have the additional covariance root root', root (p, k) [SI], or
     (p + U, k) where the same errors also move the setup at a known machine.
@@ -618,24 +622,32 @@ def add_covariance(
     intervals (NaN) stays without. The setup parameters follow the machine by their slope. `degrees`
     of freedom of the size of the covariance, infinite where it is known, count in the effective
     ones of every interval. The finding says why it is added; its code is the source of the new part
-    of `posterior.parts`.
+    of `posterior.parts`, which the `uncertain` ones of the old covariance follow.
     """
     root, own = np.split(np.asarray(root, dtype=np.float64), [len(fit.tolerance)])
-    posterior = add_to_posterior(fit.posterior, CovariancePart(finding.code, root, degrees))
-    if len(own) and posterior.frames is not None:
-        frames = posterior.frames.add_errors(fit.nuisance.names, fit.nuisance.estimate, own)
-        posterior = replace(posterior, frames=frames)
-    nuisance = fit.nuisance
-    if len(nuisance):  # infinite standard deviations stay infinite, and NaN stays NaN
+
+    def move_setup() -> NuisanceEstimate:
+        nuisance = fit.nuisance
+        if not len(nuisance):
+            return nuisance
+        # infinite standard deviations stay infinite, and NaN stays NaN
         change = nuisance.slope @ (root / fit.tolerance[:, None]) + (own if len(own) else 0.0)
         added = np.where(nuisance.table.free, (change**2).sum(axis=1), 0.0)
-        nuisance = replace(nuisance, sd=np.sqrt(nuisance.sd**2 + added))
-    return replace(
-        fit,
-        covariance=fit.covariance + root @ root.T,
-        posterior=posterior,
-        nuisance=nuisance,
-        findings=(*fit.findings, finding),
+        return replace(nuisance, sd=np.sqrt(nuisance.sd**2 + added))
+
+    def turn_directions() -> Posterior:
+        posterior = add_to_posterior(fit.posterior, CovariancePart(finding.code, root, degrees))
+        posterior = replace(posterior, parts=(*posterior.parts, *uncertain))
+        if not len(own) or posterior.frames is None:
+            return posterior
+        frames = posterior.frames.add_errors(fit.nuisance.names, fit.nuisance.estimate, own)
+        return replace(posterior, frames=frames)
+
+    return fit.with_fields(
+        covariance=later(lambda: fit.covariance + root @ root.T),
+        posterior=later(turn_directions),
+        nuisance=later(move_setup),
+        findings=later(lambda: (*fit.findings, finding)),
     )
 
 

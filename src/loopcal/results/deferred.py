@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import fields
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 
 class _Later(NamedTuple):
@@ -44,6 +44,13 @@ def deferred() -> Any:
 
 class DeferredFields:
     """Base of frozen dataclasses with deferred fields: a copy or a pickle has their values."""
+
+    def with_fields(self, **values: Any) -> Self:
+        """Return a copy with other values of some fields; the others stay deferred."""
+        copied = object.__new__(type(self))
+        kept = {field.name: self.__dict__[field.name] for field in fields(self)}  # type: ignore[arg-type]
+        copied.__dict__.update(kept | values)
+        return copied
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the content of the record, all of it computed."""

@@ -661,7 +661,7 @@ class Image(Kind):
             moving = (T[:, None, :3, None, :3] * np.eye(4)[:, None, :, None]).reshape(-1, 3, 12)
             origin = np.repeat(T[:, :3, 3], 4, axis=0)
             sets = (seen.reshape(-1, 3)[None], moving[None], origin[None])
-            frames, places = geometry.solve_frame_and_points(*sets)[0]
+            frames, places, _ = geometry.solve_frame_and_points(*sets)
             tools = [geometry.align_point_sets(q, of.reshape(4, 3)) for of in places]
             pairs += list(zip(frames, tools, strict=True))
         for frame, tool in ((None, stated[carried]), (stated[fixed], None)):

@@ -335,10 +335,10 @@ class Position(TargetKind):
             moving = own[:, :, None, :3, None, :3] * np.eye(k)[:, None, :, None]
             moving = moving.reshape(len(chosen), r * k, 3, 3 * k)
             origin = np.repeat(own[:, :, :3, 3], k, axis=1)
-            solved = geometry.solve_frame_and_points(positions[chosen], moving, origin)
-            frames, places = (np.concatenate(part) for part in zip(*solved, strict=True))
+            sets = positions[chosen], moving, origin
+            frames, places, of = geometry.solve_frame_and_points(*sets)
             items = {"frame": setup.encode_frame(self.T_base_frame, frames), "targets": places}
-            ends = np.cumsum([len(of_set) for of_set, _ in solved])[:-1]
+            ends = np.flatnonzero(np.diff(of)) + 1
             for j, of_set in zip(chosen, np.split(self.assemble_values(items), ends), strict=True):
                 guesses[j] = of_set
         return guesses
