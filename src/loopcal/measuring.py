@@ -110,7 +110,7 @@ def prepare_session(
 @dataclass
 class MeasuringSession:
     """The state of one session: rows, skipped poses, and the pose to measure next; `say` shows
-    paragraphs, tables and findings.
+    paragraphs, tables and findings. known : cells of earlier rows that the export has not repeated.
     """
 
     task: CompanionTask
@@ -123,10 +123,11 @@ class MeasuringSession:
     chosen: int | None = None
     pose: int | None = None
     progress: tuple[Finding, ...] = ()
+    known: list[dict[str, str]] = field(default_factory=list)
 
     def resume(self) -> None:
         """Take the rows that are on the disk."""
-        visits = self.journal.visits
+        visits, self.known = self.journal.visits, list(self.journal.measured)
         judged = [visit for visit in visits if visit.is_used is not None]
         self.state = self._restore(judged)
         if visits:
@@ -226,7 +227,10 @@ class MeasuringSession:
             self.say(*new.findings)
             for row in new.rows:
                 cells = convert_cells(row, new.units, journal.sheet, journal.columns)
-                yield row.get("pose", ""), cells
+                if not row.get("pose") and cells in self.known:  # of an earlier command
+                    self.known.remove(cells)
+                else:
+                    yield row.get("pose", ""), cells
 
     def _decide(self, word: str) -> bool:
         """Take the last row back, use it or leave it out; return whether there is one."""

@@ -65,7 +65,9 @@ class Visit:
 
 @dataclass
 class Journal:
-    """The open rows.csv of a session; `visits` without those that were taken back."""
+    """The open rows.csv of a session; `visits` without those that were taken back. measured : the
+    cells of all rows, also of these.
+    """
 
     path: Path
     sheet: Table
@@ -73,6 +75,7 @@ class Journal:
     descriptor: int
     count: int = 0
     visits: list[Visit] = field(default_factory=list)
+    measured: list[Row] = field(default_factory=list)
 
     def measure(self, pose: str, cells: Row) -> None:
         """Add a row; it is on the disk when this returns."""
@@ -92,6 +95,7 @@ class Journal:
         """Do what a line says."""
         if event == MEASURED:
             self.visits.append(Visit(number, pose, time, cells))
+            self.measured.append(cells)
             self.count = number
         elif event == TAKEN_BACK:
             self.visits = [visit for visit in self.visits if visit.number != number]
