@@ -384,7 +384,8 @@ class TreeElimination(TrialBatch):
         """Return the directions (U, d) that no row of the first trial determines, at a known
         machine; the largest entry of each is 1.
         """
-        null, first = np.zeros((self.shift.shape[1], len(self.tree.node))), 0
+        count = sum(int(node.unobservable[0].any(axis=2).sum()) for node in self.nodes)
+        null, first = np.zeros((self.shift.shape[1], count)), 0
         for structure, node in zip(self.tree.structures, self.nodes, strict=True):
             own, u = structure.unknowns, structure.unknowns.shape[1]
             if structure.width > u:  # unknowns follow their ancestors
@@ -395,7 +396,6 @@ class TreeElimination(TrialBatch):
             null[own[places], columns[:, None]] = node.unobservable[0][places, rows]
             null[own[places], columns[:, None]] /= self.length[0][own[places]]
             first += len(places)
-        null = null[:, :first]
         return np.asarray(null / np.abs(null).max(axis=0, initial=0.0))
 
     def variances(self) -> FloatArray:
