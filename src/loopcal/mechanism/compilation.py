@@ -566,8 +566,8 @@ def _choose_readings(robot: Mechanism, state: State, still: bool = False) -> Int
     moved = motions / robot.joint_units @ sums.weights[0, :count].T * robot.drive_units[:count]
     rods = {limb.actuator for limb in robot.assembly.limbs}
     is_rod = [not rods.isdisjoint(a.driven_joints) for a in robot.actuators[:count]]
-    _, _, order = qr(moved * np.where(is_rod, LESS, 1.0), mode="economic", pivoting=True)
-    return np.sort(order[: len(moved)])
+    order = qr(moved * np.where(is_rod, LESS, 1.0), mode="economic", pivoting=True)[-1]
+    return np.sort(np.asarray(order[: len(moved)], np.int64))
 
 
 def _compute_chain_size(stages: Sequence[Stage]) -> float:

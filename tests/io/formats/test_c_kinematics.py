@@ -18,6 +18,7 @@ from loopcal.io.formats.c_kinematics import fill_template, list_movable, write
 from loopcal.io.formats.program_format import ExportSource
 from loopcal.units import Dimension
 from tests.mechanism.actuation.test_couplings import BELT, PINION
+from tests.mechanism.actuation.test_summed_drives import CELL, THIRD
 from tests.over_constrained import EXECHON
 from tests.robot_texts import load_text
 from tests.zoo import ROBOTS
@@ -393,3 +394,9 @@ def test_terms_without_an_input_in_the_file_are_named() -> None:
     (finding,) = exported.findings
     assert "q1.compliance" in str(finding)
     assert write(ExportSource(lc.load_robot("warm-delta"), {}, {}), None).findings == ()
+
+
+def test_a_stage_with_redundant_sums_agrees(tmp_path: Path) -> None:
+    readings = "h: {reads: length}\n      k: {reads: length}"
+    robot = draw_machine(load_text(tmp_path, CELL.replace(THIRD, readings)))
+    assert compile_and_run(export_text(robot), tmp_path).startswith("50 poses, 0 failed")
