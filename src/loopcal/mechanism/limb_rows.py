@@ -145,12 +145,13 @@ def stack_closure_rows(program: Program, blocks: engine.ClosureBlocks) -> FloatA
     """Return all closure rows (t, n, c, M + J) against the freedoms of all nodes, then the driven
     joints.
     """
-    M, rows = len(program.unknown_twists), []
-    for own in divide_limbs(program, blocks):
-        whole = np.zeros((*own.A.shape[:3], M + program.n_joints))
-        whole[..., :M], whole[..., M + own.drives] = own.A, own.Q
-        rows.append(whole)
-    return np.concatenate(rows, axis=2)
+    M, limbs, last = len(program.unknown_twists), [*divide_limbs(program, blocks)], 0
+    count, shape = sum(own.A.shape[2] for own in limbs), limbs[0].A.shape[:2]
+    out = np.zeros((*shape, count, M + program.n_joints))
+    for own in limbs:
+        first, last = last, last + own.A.shape[2]
+        out[:, :, first:last, :M], out[:, :, first:last, M + own.drives] = own.A, own.Q
+    return out
 
 
 def stack_scaled_rows(robot: Mechanism, blocks: engine.ClosureBlocks) -> FloatArray:
