@@ -19,7 +19,9 @@ import numpy as np
 
 from loopcal import engine, geometry
 from loopcal.engine import PITCH, Program, State
-from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.actuation import differentiate_driven_joints, drive_joints
+from loopcal.mechanism.limb_rows import differentiate_displacements
+from loopcal.mechanism.model import Mechanism, ParameterUnits
 from loopcal.mechanism.transmission import invert_weights
 from loopcal.typing import BoolArray, FloatArray
 
@@ -49,29 +51,27 @@ def list_unknown_joints(program: Program) -> list[tuple[int, int, int]]:
 
 
 def differentiate_unknowns(
-    robot: Mechanism,
-    e: FloatArray,
-    q: FloatArray,
-    state: State,
-    displacements: FloatArray,
-    joints: FloatArray,
+    robot: Mechanism, values: FloatArray, q: FloatArray, state: State, columns: ParameterUnits
 ) -> FloatArray:
-    """Differentiate the unknowns of a least-squares closure, (t, n, u, w): the freedoms of all
-    nodes, then the joints of `list_unknown_joints`; NaN at singular poses.
-
-    e, q : as in `loopcal.engine.differentiate`. displacements (t | 1, d, p), joints (t | 1, n | 1,
-    J, w) : their derivatives by w inputs, of which p are parameters.
+    """Differentiate the unknowns of a least-squares closure, (t, n, u, p + a), by parameters and
+    readings: the freedoms of all nodes, then the joints of `list_unknown_joints`; NaN at singular
+    poses.
     """
+    e, _, driven = drive_joints(robot, values, q)
+    displacements = columns.select(differentiate_displacements(robot, values))
+    joints = columns.select(differentiate_driven_joints(robot, values, q))
     (t, n), w = state.T.shape[:2], joints.shape[3]
     e, displacements = (np.broadcast_to(a, (t, *a.shape[1:])) for a in (e, displacements))
-    q, joints = (np.broadcast_to(a, (t, n, *a.shape[2:])) for a in (q, joints))
+    driven, joints = (np.broadcast_to(a, (t, n, *a.shape[2:])) for a in (driven, joints))
     u = len(robot.program.unknown_twists) + len(list_unknown_joints(robot.program))
     out = np.empty((t, n, u, w))
     for i in range(t):
         for first in range(0, n, POSES):
             rows = i, slice(first, first + POSES)
             start = state.map(lambda a, rows=rows: a[rows])
-            slopes = _difference_steps(robot, e[i], q[rows], start, displacements[i], joints[rows])
+            slopes = _difference_steps(
+                robot, e[i], driven[rows], start, displacements[i], joints[rows]
+            )
             out[rows] = -np.matmul(invert_weights(slopes[..., :u]), slopes[..., u:])
     return out
 
@@ -84,8 +84,9 @@ def _difference_steps(
     displacements: FloatArray,
     joints: FloatArray,
 ) -> FloatArray:
-    """Return the derivatives (n, u, u + w) of the steps of one trial by unknowns and inputs, of
-    arrays without the axis t.
+    """Return the derivatives (n, u, u + w) of the steps of one trial by unknowns and w inputs, p of
+    which are parameters, of arrays without the axis t: displacements (d, p) and driven joints (n,
+    J, w) by the inputs, at e (d,) and q (n, J).
     """
     program, size, p, w = robot.program, robot.size, displacements.shape[1], joints.shape[2]
     twists, passive = program.unknown_twists, list_unknown_joints(program)

@@ -34,12 +34,7 @@ from loopcal.mechanism.least_squares_closure import (
     find_open_loops,
     list_unknown_joints,
 )
-from loopcal.mechanism.limb_rows import (
-    differentiate_displacements,
-    move_passive_joints,
-    name_entries,
-    name_passive_joints,
-)
+from loopcal.mechanism.limb_rows import move_passive_joints, name_entries, name_passive_joints
 from loopcal.mechanism.model import Mechanism, ParameterUnits
 from loopcal.mechanism.states import is_closed
 from loopcal.mechanism.transmission import apply_weights, invert_weights
@@ -77,10 +72,9 @@ def differentiate_pose(
         derivatives = [by_parameters, turned]
     is_open = find_open_loops(robot, state)
     if is_open.any():
-        moved = spread_twists(
-            robot.program, _differentiate_open(robot, values, q, state, chosen), nodes
-        )
-        for derivative, own in zip(derivatives, np.split(moved, [p], axis=3), strict=True):
+        moved = differentiate_unknowns(robot, values, q, state, chosen)
+        parts = np.split(spread_twists(robot.program, moved, nodes), [p], axis=3)
+        for derivative, own in zip(derivatives, parts, strict=True):
             derivative[is_open] = own[is_open]
     lost = ~is_closed(state.status)
     if lost.any():
@@ -97,20 +91,6 @@ def spread_twists(program: engine.Program, moved: FloatArray, nodes: int = 1) ->
     out = np.zeros((*moved.shape[:2], 6 * nodes, moved.shape[3]))
     out[:, :, freedoms] = moved[:, :, : len(freedoms)]
     return out
-
-
-def _differentiate_open(
-    robot: Mechanism, values: FloatArray, q: FloatArray, state: State, columns: ParameterUnits
-) -> FloatArray:
-    """Return derivatives (t, n, u, p + a), by parameters and readings, of the unknowns of a
-    least-squares closure.
-    """
-    e, _, joints = drive_joints(robot, values, q)
-    by_all = (
-        differentiate_displacements(robot, values),
-        differentiate_driven_joints(robot, values, q),
-    )
-    return differentiate_unknowns(robot, e, joints, state, *map(columns.select, by_all))
 
 
 def differentiate_platform(
@@ -218,7 +198,7 @@ def differentiate_passive_joints(
     by_inputs = move_passive_joints(robot, values, state, twists, driven)
     is_open = find_open_loops(robot, state)
     if is_open.any():
-        own = _differentiate_open(robot, values, q, state, robot.all_parameters)
+        own = differentiate_unknowns(robot, values, q, state, robot.all_parameters)
         for i, (g, k, j) in enumerate(list_unknown_joints(program), len(program.unknown_twists)):
             limb = robot.assembly.limbs[program.groups[g].limbs[k]]
             place = names.index(f"{limb.name}.{limb.joints[j].name}")
