@@ -306,15 +306,16 @@ def _differentiate_sums(
     """
     slots, (_, tau) = robot.slots, robot.slots(values)
     weights = select_weights(tau, slots.constants)
-    if weights is None:
-        by_terms = np.stack(term_derivatives(q, tau, slots.constants), axis=3)
-        weights = np.eye(robot.program.n_joints)[None]
-    else:
-        by_terms = differentiate_sums(q, tau, slots.constants, lengths)
     of_terms = slots.jacobian(values)[:, slots.n_displacements :]
     of_terms = of_terms.reshape(len(of_terms), *slots.terms.shape, -1)
-    by_parameters = np.moveaxis(np.matmul(np.moveaxis(by_terms, 2, 1), of_terms), 1, 2)
-    by_readings = differentiate_by_readings(q, tau, slots.constants)
+    with np.errstate(invalid="ignore"):  # as in `drive_joints`
+        if weights is None:
+            by_terms = np.stack(term_derivatives(q, tau, slots.constants), axis=3)
+            weights = np.eye(robot.program.n_joints)[None]
+        else:
+            by_terms = differentiate_sums(q, tau, slots.constants, lengths)
+        by_parameters = np.moveaxis(np.matmul(np.moveaxis(by_terms, 2, 1), of_terms), 1, 2)
+        by_readings = differentiate_by_readings(q, tau, slots.constants)
     lead = np.broadcast_shapes(*(a.shape[:2] for a in (by_parameters, by_readings, lengths)))
     both = (np.broadcast_to(a, (*lead, *a.shape[2:])) for a in (by_parameters, by_readings))
     return weights[:, None], Derivatives(*both)

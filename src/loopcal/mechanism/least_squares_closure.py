@@ -121,6 +121,6 @@ def _difference_steps(
     end = engine.solve(program, E, Q, start, max_iterations=1)
     ends = (end.T, *end.others)
     steps = [geometry.pose_difference(ends[node], nodes[node])[..., f] for node, f in twists]
-    steps += [(end.joints[g] - start.joints[g])[:, :, k, j] for g, k, j in passive]
+    steps += [(end.joints[g][:, :, k, j] - start.joints[g][:, :, k, j]) for g, k, j in passive]
     slopes = np.stack(steps, axis=2) / (2 * change)[:, None, None]
     return np.moveaxis(slopes[: u + w] + slopes[u + w :], 0, 2)

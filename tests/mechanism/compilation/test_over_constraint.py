@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 
 from loopcal import engine, geometry
 from loopcal.diagnose.identifiable_parameters import identifiability
@@ -224,6 +224,22 @@ def test_derivatives_of_passive_joints_of_open_loops_agree_with_differences(text
     for i, unit in enumerate(h * np.eye(q.shape[2])):
         differences = (read(0 * values[0], unit) - read(0 * values[0], -unit)) / (2 * h)
         assert_allclose(D.readings[..., i], differences, atol=2e-7)
+
+
+def test_readings_that_lead_nowhere_leave_the_derivatives_of_other_rows_alone(tmp_path) -> None:
+    robot = load_text(tmp_path, close_by_least_squares(EXECHON))
+    values, q = draw(robot, 4)
+    lost = q.copy()
+    lost[:, 1], lost[:, 2] = np.nan, np.inf
+    D, E = (
+        differentiate_passive_joints(
+            robot, values, readings, forward_trials(robot, values, readings)
+        )
+        for readings in (q, lost)
+    )
+    for good, other in ((D.parameters, E.parameters), (D.readings, E.readings)):
+        assert_array_equal(np.isfinite(other).all(axis=(0, 2, 3)), [True, False, False, True])
+        assert_allclose(other[:, [0, 3]], good[:, [0, 3]], rtol=1e-9)  # [1] rounding of differences
 
 
 def test_least_squares_closure_without_repeated_equations_changes_nothing(tmp_path: Path) -> None:
