@@ -13,7 +13,7 @@ from loopcal import geometry
 from loopcal.errors import MechanismError
 from loopcal.mechanism.assembly import Actuator, Address, LinearMap
 from loopcal.mechanism.compilation import build
-from loopcal.mechanism.kinematics import forward_trials
+from loopcal.mechanism.kinematics import compute_readings, forward_trials
 from loopcal.mechanism.sensitivity import differentiate_passive_joints, differentiate_pose
 from loopcal.mechanism.solutions import forward, make_solution
 from loopcal.mechanism.transmission import (
@@ -241,6 +241,18 @@ def test_failed_rows_have_nan_derivatives_of_passive_joints():
     )
     assert np.isfinite(result.parameters[0, 0]).all()
     assert np.isnan(result.parameters[0, 1]).all()
+
+
+@pytest.mark.parametrize("name", ["core-xy", "hexapod-elastic", "par4", "pulley-3", "warm-delta"])
+def test_infinite_readings_of_sums_and_loads_have_nan_derivatives_without_a_warning(name):
+    robot = zoo.load_cached_robot(name)
+    q = np.repeat(compute_readings(robot, robot.values[None], robot.home_state), 2, axis=1)
+    q[0, 1] = np.inf
+    given = robot, robot.values[None], q, forward_trials(robot, robot.values[None], q)
+    pose, passive = differentiate_pose(*given), differentiate_passive_joints(*given)
+    for derivatives in (pose.parameters, pose.readings, passive.parameters, passive.readings):
+        assert np.isfinite(derivatives[0, 0]).all()
+        assert np.isnan(derivatives[0, 1]).all()
 
 
 def test_ups_legs_have_no_locked_joint():

@@ -284,7 +284,8 @@ def differentiate_driven_joints(robot: Mechanism, values: FloatArray, q: FloatAr
     """
     joints = drive_joints(robot, values, q).joints
     weights, moved = _differentiate_sums(robot, values, q, joints)
-    return np.matmul(invert_weights(weights), np.concatenate(moved, axis=3))
+    with np.errstate(invalid="ignore"):  # as in `drive_joints`
+        return np.matmul(invert_weights(weights), np.concatenate(moved, axis=3))
 
 
 def differentiate_joints_by_readings(

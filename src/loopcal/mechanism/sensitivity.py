@@ -65,10 +65,12 @@ def differentiate_pose(
         derivatives = np.split(spread_twists(robot.program, moved, nodes), [p], axis=3)
     else:
         e, tau, joints = drive_joints(robot, values, q)
-        inputs = chosen.linearize(values, tau, q)
-        by_parameters, turned = engine.differentiate(robot.program, e, joints, state, inputs, nodes)
-        if robot.has_sums:
-            turned = np.matmul(turned, differentiate_joints_by_readings(robot, values, q))
+        with np.errstate(invalid="ignore"):  # as in `drive_joints`
+            inputs = chosen.linearize(values, tau, q)
+            given = robot.program, e, joints, state, inputs, nodes
+            by_parameters, turned = engine.differentiate(*given)
+            if robot.has_sums:
+                turned = np.matmul(turned, differentiate_joints_by_readings(robot, values, q))
         derivatives = [by_parameters, turned]
     is_open = find_open_loops(robot, state)
     if is_open.any():
