@@ -340,9 +340,7 @@ def _compare_interpretations(
     if against is not None and against.misfit <= ALLOWED:
         return _contradict(misfit, against)
     find_pairs = misfit > IMPLAUSIBLE
-    chosen, tried, pairs, possible = search_interpretations(
-        free, thinned, stated, misfit, find_pairs
-    )
+    chosen, tried, possible = search_interpretations(free, thinned, stated, misfit, find_pairs)
     # those beyond unknown frames: of the data as written or as read, whichever has fewer
     compared = (stated, None if chosen is None else chosen.comparison)
     linear = [c.linearization for c in compared if c is not None]
@@ -378,7 +376,7 @@ def _compare_interpretations(
     if not misfit > IMPLAUSIBLE or has_errors:
         return ConventionCheck(misfit)
     if has_enough:
-        description |= {"tried": tried, "pairs": pairs, "possible": possible}
+        description |= {"tried": tried, "possible": possible}
         finding = report_finding("conventions.unexplained", **description)
         return ConventionCheck(misfit, finding=finding)
     listed = () if chosen is None else (chosen.interpretation, *chosen.alternatives)

@@ -12,7 +12,6 @@ docs/theory/residual-patterns.md.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -641,28 +640,26 @@ class _Test(NamedTuple):
 
 def search_interpretations(
     free: FreeParameters, data: Measurements, stated: Comparison | None, misfit: float, pairs: bool
-) -> tuple[Selection | None, dict[str, int], int, str]:
+) -> tuple[Selection | None, int, str]:
     """Search for the interpretation that fits far better than the stated one.
 
     data : as written. stated : their comparison at the poses that the robot reaches; None where it
         reaches too few. misfit : of the data as written. pairs : test pairs if no single
         interpretation explains the data.
-    Returns the interpretation that explains the data, None without one; the number of single
-    interpretations that were tested by slip, and the number of pairs; the unit, in words, in which
-    the data would fit where that is no evidence, because values so small fit by chance.
+    Returns the interpretation that explains the data, None without one; the number of tested
+    ones; the unit, in words, in which the data would fit where that is no evidence, because values
+    so small fit by chance.
     """
     written = None if stated is None else stated.data
     search = _Search(free, data, written, misfit)
     select, singles = search.select_best, search.test_all()
-    tried = dict(Counter(test.interpretation.slip for test in singles))
-    best, count = select(singles, ALLOWED), 0
+    best, count = select(singles, ALLOWED), len(singles)
     if best is None and pairs:
         parameters = search.test_parameters()
-        tried |= Counter(test.interpretation.slip for test in parameters)
-        best = select(parameters, ALLOWED)
+        best, count = select(parameters, ALLOWED), count + len(parameters)
     if best is None and pairs:
         tested = list(search.test_pairs(singles))
-        best, count = select(tested, ALLOWED), len(tested)
+        best, count = select(tested, ALLOWED), count + len(tested)
     if best is None:
         best = select(singles, misfit / FAR_BETTER if np.isfinite(misfit) else LARGEST)
         if best is not None and best.misfit > ALLOWED and not _is_robot_far(stated, best):
@@ -670,8 +667,8 @@ def search_interpretations(
     units = [test for test in singles if test.interpretation.slip == "unit"]
     possible = min(units, key=lambda test: test.misfit, default=None)
     if best is not None or possible is None or possible.misfit > ALLOWED:
-        return best, tried, count, ""
-    return best, tried, count, str(possible.interpretation.finding)
+        return best, count, ""
+    return best, count, str(possible.interpretation.finding)
 
 
 def _is_robot_far(stated: Comparison | None, chosen: Selection) -> bool:

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from loopcal.findings.catalog import find_entry, word_phrase
-from loopcal.findings.wording import choose_symbol, fill_template, list_names, name_count
+from loopcal.findings.wording import choose_symbol, fill_template, list_names
 
 Data = Mapping[str, Any]
 
@@ -29,25 +29,6 @@ SHOWN_REASONS = 3
 
 EQUAL = 1e-6
 """Relative difference up to which two changes are equal."""
-
-TRIED = {
-    "unit/units": "unit",
-    "gear factor (2, 1.5 or inverse)/gear factors (2, 1.5 and inverses)": "gear-factor",
-    "form of the rotation/forms of the rotation": "scalar-last orientation-form",
-    "inversion/inversions": "inverted-rotations inverted-poses",
-    "mirrored frame/mirrored frames": "left-handed-frame",
-    "sign/signs": "sign angle-signs reading-sign",
-    "zenith angle/zenith angles": "zenith-angles",
-    "order of columns/orders of columns": "swapped-columns permuted-columns",
-    "order of targets/orders of targets": "swapped-targets permuted-targets",
-    "order of actuators/orders of actuators": (
-        "swapped-readings reversed-readings permuted-readings"
-    ),
-    "shift by one row/shifts by one row": "shifted-readings",
-    "zero of readings/zeros of readings": "reading-zero",
-    "unknown setup item/unknown setup items": "undeclared-setup",
-}
-"""Name of tested changes, for one and for several -> kinds of slips."""
 
 
 def changes(data: Data, most: int = MOST_PARTS) -> str:
@@ -149,18 +130,6 @@ def correction(data: Data) -> str:
         fill_template(find_entry(part["code"]).action, **part)
         for part in slip.get("parts", (slip,))
     )
-
-
-def tried_changes(data: Data) -> str:
-    """Return the numbers of tested changes, by their kinds, and of pairs of them."""
-    names = {slip: name for name, slips in TRIED.items() for slip in slips.split()}
-    counts: dict[str, int] = {}
-    for slip, n in data["tried"].items():
-        counts[names[slip]] = counts.get(names[slip], 0) + n
-    words = [name_count(n, *name.split("/")) for name, n in counts.items()]
-    if data["pairs"]:
-        words.append(fill_template("{pairs:count pair/pairs} of these", **data))
-    return ", ".join(words)
 
 
 def times_larger(data: Data) -> str:
