@@ -199,7 +199,7 @@ function drawSession() {
   $("said").className = session.visits.at(-1)?.is_used === false ? "doubt" : "";
   draw("visits", session.visits, () => {
     const body = [...session.visits].reverse().map((visit) => h("tr", { className: visit.is_used === false ? "out" : "" },
-      h("th", { scope: "row", textContent: visit.pose }), ...Object.values(visit.cells).map((cell) => h("td", { textContent: cell })),
+      h("th", { scope: "row", textContent: visit.pose }), ...Object.values(visit.cells).map((cell) => h("td", { textContent: cell.length > 9 ? Number(cell).toPrecision(7) : cell })),
       h("td", { textContent: visit.is_used === false ? "left out" : "used" })));
     const head = ["pose", ...session.headers, "row"].map((text) => h("th", { scope: "col", textContent: text }));
     const table = h("table", {}, h("caption", { textContent: "Rows so far, the last one first" }),

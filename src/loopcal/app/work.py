@@ -29,6 +29,7 @@ class Said:
     codes: dict[str, int] = field(default_factory=dict)
 
 
+@dataclass(eq=False)
 class Work:
     """The commands that run in a folder, and how far they are.
 
@@ -36,17 +37,13 @@ class Work:
     word : the text of a command as people get it.
     """
 
-    def __init__(
-        self,
-        folder: Path,
-        changed: Callable[[], None],
-        store: Callable[[], None],
-        word: Callable[[str], str],
-    ) -> None:
-        self.folder, self.changed, self.store, self.word = folder, changed, store, word
-        self.progress: tuple[str, int, int] | None = None
-        self.task: asyncio.Task[None] | None = None
-        self.process: asyncio.subprocess.Process | None = None
+    folder: Path
+    changed: Callable[[], None]
+    store: Callable[[], None]
+    word: Callable[[str], str]
+    progress: tuple[str, int, int] | None = None
+    task: asyncio.Task[None] | None = None
+    process: asyncio.subprocess.Process | None = None
 
     def begin(self, steps: Mapping[str, Sequence[str]], said: Said) -> None:
         """Run commands, title -> words, while others are answered."""
