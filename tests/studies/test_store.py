@@ -8,6 +8,7 @@ import signal
 import sqlite3
 import subprocess
 import sys
+import tempfile
 import threading
 from contextlib import closing
 from dataclasses import replace
@@ -37,11 +38,13 @@ from loopcal.studies.specification import (
     list_conflicts,
 )
 from tests.findings.expectations import expect_refusal
+from tests.io.folder_writing import run_in_copy
 from tests.studies.studies import compute_block_key
 
 HEADER = StoreHeader("{}", ("outcome", "position", "rank"), {"numerics": "1"})
 A, B = {"robot": "r", "poses": "10"}, {"robot": "r", "poses": "20"}
 ROOT = str(Path(__file__).parents[2])
+NOBODY = 65534
 
 
 def make_scores(number: int, trials: int = 4) -> np.ndarray:
@@ -280,6 +283,24 @@ def test_readers_leave_no_file_beside_a_store_that_no_driver_has(folder) -> None
             assert reader.count_cell(A).blocks == 2
     assert [path.name for path in folder.iterdir()] == [NAME]
     assert (folder / NAME).read_bytes() == before
+
+
+@pytest.mark.forks
+@pytest.mark.skipif(os.name == "nt" or os.geteuid() != 0, reason="needs permissions to drop")
+def test_store_in_a_folder_of_another_user_is_read() -> None:
+    with tempfile.TemporaryDirectory() as place:
+        Path(place).chmod(0o755)
+        make_store(Path(place), HEADER)
+        with open_store(Path(place)) as store:
+            store.add_block("key", A, 0, make_scores(0), 0.5)
+
+        def count_blocks() -> int:
+            os.setuid(NOBODY)
+            with read_store(Path(place)) as store:
+                return store.count_cell(A).blocks
+
+        assert run_in_copy(count_blocks) == (0, 1)
+        assert [path.name for path in Path(place).iterdir()] == [NAME]
 
 
 FULL = """

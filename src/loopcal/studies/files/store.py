@@ -387,7 +387,8 @@ def read_store(folder: Path) -> Iterator[StudyStore]:
     # only a connection that could write removes the files of the log when it is the last one
     is_writable = os.access(path, os.W_OK) and os.access(folder, os.W_OK)
     mode = STILL if is_copy else "mode=rw" if is_writable else "mode=ro"
-    if mode != STILL and is_still and not is_driven(folder) and _is_disk_full(path, mode):
+    is_left = mode != STILL and is_still and not is_driven(folder)
+    if is_left and (not is_writable or _is_disk_full(path, mode)):
         mode = STILL  # other modes make files for the log
     with _report_errors(path), closing(_connect(path, mode)) as connection:
         connection.execute("PRAGMA query_only = ON")
