@@ -25,16 +25,16 @@ def bench_demo() -> Metric:
     times = []
     for _ in range(REPEATS):
         with tempfile.TemporaryDirectory() as folder:
-            fit = _run(
+            fit = run_command(
                 "calibrate", "hexapod-42", str(DATA), "--hold-out", "0.25", "-o", f"{folder}/run"
             )
-            times.append((fit, _run("report", f"{folder}/run", "-o", f"{folder}/report.html")))
+            times.append((fit, run_command("report", f"{folder}/run", "-o", f"{folder}/report.html")))
     fit, report = min(times, key=sum)
     note = f"best of {REPEATS}; calibration {fit:.3g} s, report {report:.3g} s"
     return Metric("report.demo", fit + report, "s", tolerance=None, limit=LIMIT, note=note)
 
 
-def _run(*words: str) -> float:
+def run_command(*words: str) -> float:
     """Run a command and return the time of the processor [s].
 
     Python may store compiled modules, as for users; otherwise each run would compile loopcal.

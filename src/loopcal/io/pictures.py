@@ -31,6 +31,7 @@ from loopcal.io.core.yaml_file import format_flow, format_yaml, read_yaml
 from loopcal.io.data.kind_settings import describe_kind, describe_stated_values
 from loopcal.io.robot.robot_file import check_format
 from loopcal.measure.kinds.image import (
+    GRAZING,
     NARROW,
     PRINT_SD,
     Image,
@@ -409,8 +410,8 @@ def _load_picture(path: Path) -> tuple[np.ndarray[Any, np.dtype[np.uint8]], floa
 
 
 def find_corners(cv2: Any, gray: Any, board: Board) -> tuple[IntArray, FloatArray]:
-    """Return numbers (n,) and pixels (n, 2) of the inner corners of a board whose squares look wide
-    enough; none where these do not determine the pose of the board.
+    """Return numbers (n,) and pixels (n, 2) of the inner corners of a board that look wide enough,
+    and not from the side; none where these do not determine the pose of the board.
     """
     dictionary = load_dictionary(cv2, board)
     layout = cv2.aruco.CharucoBoard(board.squares, board.square, board.marker, dictionary)
@@ -438,8 +439,9 @@ def find_corners(cv2: Any, gray: Any, board: Board) -> tuple[IntArray, FloatArra
     pixels = cv2.perspectiveTransform(found.astype(float), H)[:, 0]
     slope = H[:2, :2] - pixels[:, :, None] * H[2, :2]  # of pixels by places
     slope = slope / (found[:, 0] @ H[2, :2] + H[2, 2])[:, None, None]
-    is_wide = side * np.linalg.svd(slope, compute_uv=False)[:, 1] > NARROW
-    return corners[is_wide], pixels[is_wide]
+    wide, narrow = np.linalg.svd(slope, compute_uv=False).T
+    is_clear = (side * narrow > NARROW) & (narrow > GRAZING * wide)
+    return corners[is_clear], pixels[is_clear]
 
 
 def _pair_neighbors(board: Board, corners: IntArray) -> list[tuple[IntArray, IntArray]]:

@@ -50,12 +50,14 @@ LENS_ITEMS: Mapping[str, tuple[str, ...]] = {
 }  # fmt: skip
 PRINT, BEND = ("scale_x", "scale_y"), ("bend_x", "bend_y", "bend_xy")
 PICTURES = 40  # pictures, evenly chosen, of which start values are made
-# Standard deviations of what nobody measured: a center as a share of the width, a scale of a print.
+# Standard deviations of what nobody measured: a center as a share of the width, a scale of a print,
+# and what a few pictures may not determine of the distortion, three times as large as in phones.
 CENTER_SD, PRINT_SD = 0.02, 0.02
-GRAZING = 0.2  # sine of the angle between board and line of sight below which no corner is found
-# Width of a square in a picture [px], where it looks narrowest, below which corners are left out.
-# From there on rendered ones are found as exactly as others to a factor of 2, below 15 px of 8.
-NARROW = 25.0
+LENS_SD = {"k3": 0.1, "p1": 0.003, "p2": 0.003}
+# Sine of the angle between board and line of sight, and width of a square in a picture [px] where
+# it looks narrowest, below which corners are left out. From there on rendered ones are found as
+# exactly as others to a factor of 2; at 76 deg from the normal of 3, and below 15 px of 8.
+GRAZING, NARROW = 0.4, 25.0
 
 
 def project(
@@ -679,15 +681,15 @@ class Image(Kind):
 def state_camera(
     camera: Image, scales: Sequence[tuple[float, float]] = ((0.0, PRINT_SD),) * 2
 ) -> tuple[Image, tuple[StatedValue, ...]]:
-    """Return a camera of which all that pictures determine is unknown, and what is known before.
+    """Return a camera of which all but bends is unknown, and what is known before.
 
     scales : those of the print along x and y, with their standard deviations. All sessions share
     them. They give the machine its size, which pictures do not determine.
     """
-    unknown = ("camera", "board", "focal", "center", "radial", "print")
+    unknown = ("camera", "board", *LENS_ITEMS, "print")
     lens, center = camera.lens or camera.camera, CENTER_SD * max(camera.size)
     stated = [StatedValue(f"{lens}.{name}", center) for name in LENS_ITEMS["center"]]
-    stated.append(StatedValue(f"{lens}.k3"))
+    stated += [StatedValue(f"{lens}.{name}", sd) for name, sd in LENS_SD.items()]
     stated += [StatedValue(f"{camera.board}.{name}", sd, scale, scope="all")
                for name, (scale, sd) in zip(PRINT, scales, strict=True)]  # fmt: skip
     return replace(camera, unknown=unknown), tuple(stated)
