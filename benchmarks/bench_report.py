@@ -28,7 +28,9 @@ def bench_demo() -> Metric:
             fit = run_command(
                 "calibrate", "hexapod-42", str(DATA), "--hold-out", "0.25", "-o", f"{folder}/run"
             )
-            times.append((fit, run_command("report", f"{folder}/run", "-o", f"{folder}/report.html")))
+            times.append(
+                (fit, run_command("report", f"{folder}/run", "-o", f"{folder}/report.html"))
+            )
     fit, report = min(times, key=sum)
     note = f"best of {REPEATS}; calibration {fit:.3g} s, report {report:.3g} s"
     return Metric("report.demo", fit + report, "s", tolerance=None, limit=LIMIT, note=note)
