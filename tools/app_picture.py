@@ -32,7 +32,6 @@ def main() -> int:
         page.set_input_files("#choose", DATA)
         page.wait_for_selector("#list li")
         page.select_option("#robot", "hexapod-42")
-        page.select_option("#hold-out", "0.25")
         page.wait_for_timeout(500)  # until the server has both
         page.click("#calibrate:enabled")
         page.wait_for_selector("#reports:not([hidden])", timeout=120_000)
