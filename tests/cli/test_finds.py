@@ -119,6 +119,11 @@ FINDS = {
         {},
         "loopcal: gough: an unknown frame is 'position'",
     ),
+    "frame without a family": (
+        "new --report-facts facts.yaml --joints base --frames x,tip",
+        {},
+        "loopcal: --frames: an unknown frame is 'x', but must be one of",
+    ),
     "sheet without its names of poses": (
         "fill linear-delta s.csv e.txt --profile spatial-analyzer -o new.csv",
         {

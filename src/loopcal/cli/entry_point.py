@@ -21,6 +21,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from importlib import import_module
+from itertools import pairwise
 from pathlib import Path
 
 import click
@@ -262,8 +263,9 @@ def _report(
 def _name_inputs(
     sentence: str, hint: str | None, command: click.Command | None, words: Sequence[str]
 ) -> str:
-    """Return a sentence with the inputs of the command in front, where it names neither one of them
-    nor an option; a word such as `run` is a name in quotes or before a colon.
+    """Return a sentence with the inputs of the command in front, or without these with the options
+    of its first word in quotes, where it names neither one of them nor an option; a word such as
+    `run` is a name in quotes or before a colon.
     """
     is_named = re.search(r"(?<!\S)'?--?[a-z]", f"{sentence} {hint or ''}") is not None
     if command is None or is_named:
@@ -276,7 +278,10 @@ def _name_inputs(
         is_word = name.isalpha()
         if any(form in sentence for form in ((f"{name}:", repr(name)) if is_word else (name,))):
             return sentence
-    return f"{' and '.join(names[:3])}: {sentence}" if names else sentence
+    quoted = re.search("'([^']*)'", sentence)
+    wrong = quoted[1] if quoted else ""
+    options = [w for w, v in pairwise(rest) if w[:1] == "-" and wrong in v.split(",")]
+    return f"{' and '.join((names or options)[:3])}: {sentence}" if names or options else sentence
 
 
 def _refuse(
