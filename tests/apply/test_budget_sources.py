@@ -341,6 +341,11 @@ def test_types_and_degrees_of_freedom_follow_the_guide():
     source = find(budget_of(fit, data), "instrument").source
     assert source.evaluation == "A"
     assert source.degrees == pytest.approx(fit.residual_test.dof)
+    robot, data, options = CASES["stated setup"]
+    rows = tuple(replace(o, covariance=4.0 * o.covariance) for o in data.observations)
+    rough = replace(data, observations=rows)
+    part = find(budget_of(identify(robot, rough, options=options), rough), "noise.setup-as-stated")
+    assert part.source.evaluation == "B"
 
 
 def test_a_discrepancy_is_a_source_of_type_a():

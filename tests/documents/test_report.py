@@ -204,6 +204,7 @@ def test_many_rows_are_thinned_and_the_report_says_so(run) -> None:
         poses=tuple(f"p{i}" for i in range(len(rows.raw) * times)),
         raw=np.tile(rows.raw, (times, 1)),
         whitened=np.tile(rows.whitened, (times, 1)),
+        measured=np.tile(rows.measured, (times, 1)),
         readings=np.tile(rows.readings, (times, 1)),
     )
     arrays = {**record.arrays, "poses": np.array(many.poses)}
@@ -245,6 +246,14 @@ def test_a_volume_that_is_asked_for_later_is_in_report_and_certificate(
     assert "box x" not in text
     assert main(["report", str(run.path), "-o", f"{page}.html", *volume[2:]]) == 1
     assert "no effect without --volume" in capsys.readouterr().err
+
+
+def test_a_report_of_a_run_draws_the_decision_on_its_limit(root, tmp_path) -> None:
+    data = str(root / "examples" / "hexapod-42" / "measurements.csv")
+    words = ["-o", str(tmp_path / "run"), "--hold-out", "0.25", "--limit-position", "20um"]
+    assert main(["calibrate", "hexapod-42", data, *words]) == 0
+    page = lc.save_report(lc.load_run(tmp_path / "run"), tmp_path / "report.html").read_text()
+    assert re.search("largest position error [^<]*, limit 20 um: conforms<", page)
 
 
 def test_limits_of_calls_are_sentences(calibration, tmp_path) -> None:

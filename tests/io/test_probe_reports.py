@@ -293,23 +293,32 @@ def test_one_wrong_height_is_an_outlier_and_no_target_that_stands_still(capsys) 
 
 
 @pytest.mark.parametrize(
-    ("config", "shift", "words"),
+    ("config", "shift", "spread", "words"),
     [
-        (REPRAP + "G31 P500 X0 Y0 Z-2.1\n", 4.2, "twice Z-2.1 of the file: its sign"),
-        (REPRAP + "G31 P500 X0 Y0 Z2.1\n", 3.0, "shift of 3 mm, and differ by 0"),
-        (REPRAP + "G31 P500 Z2.1\n", 0.5, "The files lack X and Y of G31"),
-        (MARLIN + "M851 X0 Y0 Z1.4\n", 2.8, "twice Z1.4 of the file: its sign"),
+        (REPRAP + "G31 P500 X0 Y0 Z-2.1\n", 4.2, 0.1, "twice Z-2.1 of the file: its sign"),
+        (REPRAP + "G31 P500 X0 Y0 Z2.1\n", 3.0, 0.1, "shift of 3 mm, and differ by 0"),
+        (REPRAP + "G31 P500 Z2.1\n", 0.5, 0.1, "The files lack X and Y of G31"),
+        (MARLIN + "M851 X0 Y0 Z1.4\n", 2.8, 0.1, "twice Z1.4 of the file: its sign"),
         (
             MARLIN + "M851 X0 Y0 Z-1.4\n",
             120.0,
-            "The heights reach 120 mm (from 120 mm). Are they in",
+            0.1,
+            "The heights range from 120 mm to 120 mm. Are they in",
+        ),
+        (
+            MARLIN + "M851 X0 Y0 Z-1.4\n",
+            0.0,
+            4.0,
+            "from -4 mm to 3.96 mm. Are they in micrometers?",
         ),
     ],
 )
-def test_what_heights_cannot_show_of_the_probe_is_said(config, shift, words, capsys) -> None:
+def test_what_heights_cannot_show_of_the_probe_is_said(
+    config, shift, spread, words, capsys
+) -> None:
     file = "config.g" if config.startswith(REPRAP) else "m503.gcode"
     Path(file).write_text(config)
-    heights = [shift + 0.1 * np.sin(k) for k in range(len(POINTS))]
+    heights = [shift + spread * np.sin(k) for k in range(len(POINTS))]
     write_points(POINTS, heights, "report.txt", *(G32 if file == "config.g" else G30))
     write_points(POINTS, heights, "bed.g", "{}", BED)
     more = "--probes bed.g" if file == "config.g" else ""

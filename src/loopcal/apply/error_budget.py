@@ -68,6 +68,7 @@ PRIOR = "prior."  # begins codes of findings on the tolerances, whose errors cou
 POSES, SEED = 200, 0  # number and seed of the poses that are drawn from the workspace
 NEGLIGIBLE = 0.01  # share of an expected error below which the sentence leaves out a source
 LENGTHS = {"position": Dimension.LENGTH, "orientation": Dimension.ANGLE}
+AS_STATED = "noise.setup-as-stated"  # code of a finding
 SOURCE_WORDS = {
     INSTRUMENT: "instrument: {name}",
     READINGS: "actuator readings",
@@ -85,7 +86,7 @@ SOURCE_WORDS = {
     "residuals.depend-on-temperature": "temperature",
     "residuals.depend-on-reading": "dependence on a reading",
     INFLATION: "factor on the expected spreads",
-    "noise.setup-as-stated": "setup parameters and common errors",
+    AS_STATED: "setup parameters and common errors",
 }
 
 
@@ -185,7 +186,7 @@ def split_covariance(linear: FitLinearization) -> CovarianceSplit:
             is_place, _, root = slow.parts[-1]
             is_place = is_place and np.array_equal(part.root, root)
             name = "position" if is_place else "orientation"
-        key = Source(part.source, name, "A", part.degrees)
+        key = Source(part.source, name, "B" if part.source == AS_STATED else "A", part.degrees)
         merged.setdefault(key, []).append(part.root / fit.tolerance[:, None])
     joined = (np.concatenate(each, axis=1) for each in merged.values())
     # what many rows do is as well a root of as many columns as parameters

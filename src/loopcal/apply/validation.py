@@ -666,7 +666,7 @@ def restore_validation(
     rest = content["without_blunders"]
     if rest is not None:
         unknown = {"commanded_before": {}, "commanded_after": {}, "not_compensable": {}}
-        unknown |= {"blunders": (), "without_blunders": None, "failed": ()}
+        unknown |= {"blunders": (), "without_blunders": None, "failed": (), "conformity": {}}
         rest = restore_validation({**content, **unknown, **rest}, {}, robot)
     return restore(
         Validation,
@@ -675,7 +675,6 @@ def restore_validation(
         units=find_error_units(robot, errors["after"]),
         noise_floor=restore(NoiseFloor, {"metrics": content["noise_floor"]}),
         findings=(),
-        conformity={},
         blunders=tuple(
             restore(Blunder, blunder, explanation=Explanation("none"))
             for blunder in content["blunders"]

@@ -152,15 +152,15 @@ def label_residuals(
             ),
             raw=np.where(measured, r.raw[0], np.nan),
             whitened=r.whitened[0],
-            measured=np.stack(
+            measured=np.reshape(  # of a kind without columns, an empty one
                 [
                     s.measured[0, :, s.kind.columns.index(column)]
                     if column in s.kind.columns
                     else np.full(len(s.poses), np.nan)
                     for column in s.kind.noise_columns
                 ],
-                axis=-1,
-            ),
+                (-1, len(s.poses)),
+            ).T,
             context=columns,
             dimensions=tuple(column.dimension for column in s.kind.noise_columns),
             # of the first pose of each row; targets on the base have none

@@ -59,8 +59,8 @@ DATE = re.compile(r"(?<!\d)20\d\d-\d\d-\d\d(?!\d)(?: \d\d:\d\d)?")
 ANSWER = re.compile(rf"Bed X:|bed probe heights:|Stopped at height|{HEIGHT_MAP}", re.IGNORECASE)
 # Command that states where the probe is beside the nozzle, and the height at which it triggers.
 OFFSETS = {"marlin": re.compile(r"\bM851\b(.*)"), "reprap": re.compile(r"\bG31\b(.*)")}
-# Median deviation of heights from their median [mm] beyond which their unit is another one.
-ROUGH = 5.0
+# Median deviation of heights from their median [mm]: beyond these, another unit is possible, sure.
+UNEVEN, ROUGH = 1.0, 5.0
 # Median height [mm] from which a wrong trigger height is as probable as wrong end stops, and beyond
 # which neither explains it.
 SHIFTED, FARTHEST = 1.0, 100.0
@@ -177,11 +177,11 @@ def check_heights(
     has; FileError where reported ones are no millimeters. Klipper's follow from motor steps.
     """
     shift, noted = float(np.median(heights)), list[Finding]()
-    is_rough = float(np.median(np.abs(heights - shift))) > ROUGH
-    if is_rough or abs(shift) > FARTHEST:
+    deviation = float(np.median(np.abs(heights - shift)))
+    if deviation > UNEVEN or abs(shift) > FARTHEST:
         least, largest = (Quantity(float(h), "mm") for h in (heights.min(), heights.max()))
         facts = {"least": least, "largest": largest, "firmware": firmware}
-        if is_rough and firmware != "klipper":
+        if deviation > ROUGH and firmware != "klipper":
             raise FileError(report_finding("files.heights-unit", **facts), path)
         noted.append(report_finding("files.heights-unit", Severity.WARNING, **facts))
     rest = float(np.sqrt(((heights - heights.mean()) ** 2).mean()))

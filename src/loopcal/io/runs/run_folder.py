@@ -100,19 +100,18 @@ BUDGET: dict[str, Any] = {
     "finding": {"text": str},
     "sources": [SOURCE],
 }
+CONFORMITY: dict[str, Any] = {
+    "decision": Literal["conforms", "does not conform", "neither conforms nor fails"],
+    **dict.fromkeys(("estimate", "low", "high", "floor", "bound", "expanded"), float),
+    **dict.fromkeys(("limit", "acceptance_limit", "rejection_limit", "guard_band"), float),
+    **dict.fromkeys(("probability", "most_probable", "level"), float),
+}
 VOLUME: dict[str, Any] = {
     "simultaneous": float,
     "pointwise": float,
     "frame": str,
     "findings": [{"code": str, "text": str}],
-    "conformity?": (
-        {
-            "decision": Literal["conforms", "does not conform", "neither conforms nor fails"],
-            **dict.fromkeys(("estimate", "expanded", "limit", "guard_band"), float),
-            **dict.fromkeys(("acceptance_limit", "rejection_limit", "level"), float),
-            **dict.fromkeys(("probability", "most_probable"), float),
-        },
-    ),
+    "conformity?": (CONFORMITY,),
 }
 # What loopcal reads back from result.json: types by key, `[of]` for a list, `(of,)` for a value
 # that may be null, `*` for any key. A key with a question mark may be absent.
@@ -137,6 +136,7 @@ STATED: dict[str, Any] = {
     "options": {"fit": {"*": Any}},
     "expected_error?": (BUDGET,),
     "volume?": (VOLUME,),
+    "validation?": ({"conformity?": {"*": CONFORMITY}},),
     "nulls?": {"*": str},
     "files": {"*": str},
 }

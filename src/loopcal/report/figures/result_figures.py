@@ -324,7 +324,7 @@ def draw_validation(validation: Validation) -> Figure:
 
 def _draw_decision(axes: Axes, quantity: str, conformity: Conformity, unit: Unit) -> None:
     """Draw the largest error with its interval on a line from accepted to rejected."""
-    unit = choose_unit(unit, [conformity.estimate])
+    unit = choose_unit(unit, [0.1 * min(conformity.limit, conformity.expanded or conformity.limit)])
     ends = ("low", "estimate", "high", "limit", "acceptance_limit", "rejection_limit")
     low, error, high, limit, accepted, rejected = (
         getattr(conformity, end) / unit.factor_to_si for end in ends
@@ -348,8 +348,8 @@ def _draw_decision(axes: Axes, quantity: str, conformity: Conformity, unit: Unit
     axes.set_xlim(0.0, right)
     axes.set_ylim(0.0, 1.1)
     axes.set_yticks([])
-    interval = " to ".join(f"{end:.{count_decimals(high, 2)}f}" for end in (low, high))
-    numbers = f"{error:.2g} (95 %: {interval}), limit {limit:.3g} {unit.symbol}"
+    least, likely, most = (f"{x:.{count_decimals(high)}f}" for x in (low, error, high))
+    numbers = f"{likely} (95 %: {least} to {most}), limit {limit:.6g} {unit.symbol}"
     title = f"largest {quantity} error {numbers}: {conformity.decision.value}"
     label_axes(axes, f"largest {quantity} error [{unit.symbol}]", "", title, grid=False)
 
