@@ -523,14 +523,15 @@ class CalibrationReport(DeferredFields, TableResult):
 
         level : probability, of all tests of the fitted poses, below which one is listed.
         """
-        named, fitted = {f.code: f.data for f in self.findings}, self.split.fitted.labels
+        named = {f.code: f.data for f in self.findings}
         labels = [*named[ALL_POSES]["poses"]] if ALL_POSES in named else []
-        if FAR_OFF in named:
-            labels += [label for label in named[FAR_OFF]["poses"] if label in fitted]
         if self.examination is not None:
             check = self.examination.outliers
             clear = (o.poses for o in check.outliers if o.p_value * check.blocks < level)
             labels += [label for poses in clear for label in poses]
+        elif FAR_OFF in named:  # why the fit did not converge
+            fitted = self.split.fitted.labels
+            labels += [label for label in named[FAR_OFF]["poses"] if label in fitted]
         return tuple(dict.fromkeys(labels))
 
     @cached_property

@@ -159,7 +159,7 @@ def label_residuals(
                     else np.full(len(s.poses), np.nan)
                     for column in s.kind.noise_columns
                 ],
-                (-1, len(s.poses)),
+                (len(s.kind.noise_columns), len(s.poses)),
             ).T,
             context=columns,
             dimensions=tuple(column.dimension for column in s.kind.noise_columns),

@@ -74,6 +74,7 @@ SETTLED = 1e-6  # squared length [standard deviations] of a step at which it end
 # Difference of sums of squares up to which another row may be the wrong one, and the largest number
 # of such rows that is named.
 RIVALS, MOST_SUSPECTS = 12.0, 3
+TIE = 1e-9  # difference of gains, which are logarithms, that rounding explains
 MOST_REPEATS = 60  # poses that are measured again to reach the goal, at most
 
 
@@ -641,7 +642,8 @@ def order_by_gain(
             at = factor_square(np.concatenate([R, RIDGE * np.eye(len(R))]))
         terms = compute_swap_terms(task.scoring, at, scaled[among])
         gain = score_additions(terms) / (1.0 if order else minutes[among])
-        order.append(among[int(np.argmax(gain))])
+        # of poses that gain equally but for rounding, as on a symmetric machine, the first one
+        order.append(among[int(np.argmax(gain >= gain.max() - TIE))])
         R = factor_square(np.concatenate([R, scaled[order[-1]]]))
         if order[-1] in left:
             left.remove(order[-1])
