@@ -256,6 +256,13 @@ def test_a_report_of_a_run_draws_the_decision_on_its_limit(root, tmp_path) -> No
     assert re.search("largest position error [^<]*, limit 20 um: conforms<", page)
 
 
+def test_errors_below_a_tenth_of_a_millimeter_are_in_micrometers(run) -> None:
+    record = load_record(run)
+    volume = {**record.result["volume"], "simultaneous": 1.79e-5}
+    result = {**record.result, "volume": volume, "validation": None}
+    assert "17.9 um" in render_html(build(replace(record, result=result), "summary"))
+
+
 def test_limits_of_calls_are_sentences(calibration, tmp_path) -> None:
     with pytest.raises(FileError, match=r"the name of a report ends in \.html, but this one has"):
         lc.save_report(calibration, tmp_path / "report.pdf")

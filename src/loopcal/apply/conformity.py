@@ -323,7 +323,7 @@ def report_conformity(
             findings.append(report_decision(quantity, result, unit, **stated))
             continue
         code = "gates.limit-exceeded" if measured > limit else "gates.limit-kept"
-        stated |= {"limit": _show(limit, unit), "error": _show(measured, unit)}
+        stated |= {"limit": show_number(limit, unit), "error": show_number(measured, unit)}
         findings.append(report_finding(code, quantity=quantity, **stated))
     return findings
 
@@ -337,18 +337,19 @@ def report_decision(quantity: str, result: Conformity, unit: Unit, **measured: A
     if unit.dimension is Dimension.LENGTH:
         unit = choose_unit(unit, [0.1 * min(result.limit, result.expanded or result.limit)])
     stated = {"pose": "", "target": "", "error": None, **measured}
-    stated |= {"error": _show(measured["error"], unit)} if measured else {}
+    stated |= {"error": show_number(measured["error"], unit)} if measured else {}
     return report_finding(
         f"conformity.{result.decision.name.lower()}",
         quantity=quantity,
         is_volume=not measured,
         **stated,
-        **{name: _show(getattr(result, name), unit) for name in STATED},
+        **{name: show_number(getattr(result, name), unit) for name in STATED},
         **{name: getattr(result, name) for name in STATED_NUMBERS},
     )
 
 
-def _show(number: float, unit: Unit) -> Quantity:
+def show_number(number: float, unit: Unit) -> Quantity:
+    """Return a number in SI in a unit."""
     return Quantity(float(number) / unit.factor_to_si, unit.symbol)
 
 

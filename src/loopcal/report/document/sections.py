@@ -137,12 +137,13 @@ def _name_instrument(facts: Mapping[str, str]) -> str:
 def _list_results(record: CalibrationRecord) -> Iterator[tuple[str, ...]]:
     """Yield error, before, after, limit and decision, in the order of what they tell of the use.
 
-    Numbers of a quantity have one unit, which suits the smallest error after calibration.
+    Numbers of a quantity have one unit, by the smallest error after calibration: um below 0.1 mm.
     """
     stated = list(_list_errors(record))
     units: dict[str, Unit] = {}
     for quantity, dimension in LENGTHS.items():
-        after = [abs(x) for _, of, _, x, _ in stated if of == quantity and x]
+        share = 0.1 if dimension is Dimension.LENGTH else 1.0
+        after = [share * abs(x) for _, of, _, x, _ in stated if of == quantity and x]
         units[quantity] = choose_unit(record.robot.get_unit(dimension), [min(after, default=0.0)])
     for words, quantity, before, after, judged in stated:
         limit = judged["limit"] if judged else None
@@ -166,10 +167,8 @@ def _list_errors(
     for quantity in (name for name in LENGTHS if name in errors.get("after", ())):
         before, after = (errors[when][quantity] for when in ("before", "after"))
         decision = (errors.get("conformity") or {}).get(quantity)
-        words = f"{quantity}, largest at {poses}"
-        yield words, quantity, before["max"], after["max"], decision
-        words = f"{quantity}, root mean square at {poses}"
-        yield words, quantity, before["rms"], after["rms"], None
+        for key, name, judged in (("max", "largest", decision), ("rms", "root mean square", None)):
+            yield f"{quantity}, {name} at {poses}", quantity, before[key], after[key], judged
     repeated = record.result.get("repeatability") or {}
     for symbol, words in ISO_9283.items():
         poses_visited = repeated.get("position") or ()
