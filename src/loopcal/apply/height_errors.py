@@ -20,6 +20,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from loopcal.apply.conformity import show_number
 from loopcal.diagnose.row_errors import (
     PredictionComparison,
     Statistics,
@@ -108,8 +109,8 @@ class HeightErrors(DrawnResult):
         n, before = len(self.poses), self.before
         mean, scatter, findings = float(before.mean()), float(before.std()), list[Finding]()
         if abs(mean) > max(SHIFTED, SHIFT_RATIO * scatter):
-            sizes: dict[str, Any] = {"shift": self._quantify(mean), "rest": self._quantify(scatter)}
-            findings.append(report_finding(SHIFT_UNDECIDED, **sizes))
+            shift, rest = (show_number(length, self.unit) for length in (mean, scatter))
+            findings.append(report_finding(SHIFT_UNDECIDED, shift=shift, rest=rest))
         centered = self.points - self.points.mean(axis=0)
         slope, _, rank, _ = np.linalg.lstsq(centered, before - mean)
         left = float(((before - mean - centered @ slope) ** 2).sum())
@@ -125,10 +126,6 @@ class HeightErrors(DrawnResult):
         data: dict[str, Any] = {"tilt": Quantity(1e3 * tilt, "mrad"), "share": share}
         data["alone"] = alone
         return [*findings, report_finding(TILT_UNDECIDED, **data)]
-
-    def _quantify(self, length: float) -> Quantity:
-        """Return a length in the unit in which all are shown."""
-        return Quantity(length / self.unit.factor_to_si, self.unit.symbol)
 
     def list_sets(self) -> Iterator[tuple[str, bool]]:
         """Yield "fitted" and "held-out" with whether they are held out, as far as there are any."""

@@ -154,7 +154,7 @@ def test_corrected_values_are_read_as_written_and_other_lines_are_kept(tmp_path,
 
 REFUSED = [
     ("reprap", "G28\n", "no M665"),
-    ("reprap", "M665 R1 H2\n", "M665 has no L"),
+    ("reprap", "M665 R1 H2\n", "L of M665 is missing"),
     ("reprap", "G20\nM665 L2 R1 H2\n", ":1: G20 selects inches"),
     ("reprap", "G28\nM665 L2:2:2:2 R1 H2\n", ":2: L of M665 has 4 lengths"),
     ("reprap", "M665 L250 R130 H2-3\n", ":1: H of M665 is '2-3', but must be a finite number"),

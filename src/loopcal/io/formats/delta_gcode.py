@@ -180,7 +180,7 @@ class GcodeFile(ValueFile):
     commands: Mapping[str, tuple[int, int]]
 
     what = "G-code file"
-    missing = "{0} has no {1}. Write it as {0} {1}.."
+    missing = "{1} of {0} is missing. Write it as {0} {1}.."
 
     @classmethod
     def parse(cls, lines: Sequence[str], path: Path, is_one_in_a_line: bool = False) -> GcodeFile:
