@@ -6,6 +6,7 @@ import re
 import numpy as np
 import pytest
 
+from loopcal.cli.entry_point import main
 from loopcal.errors import FileError
 from loopcal.io.data.measurement_file import load_measurements
 from loopcal.io.exports.conversion import Conversion
@@ -31,6 +32,7 @@ P1;1,5;2;203;12,5;0;7
 P2;4;5;204;3;9,75;0
 P3;4,5;5;205;;9,75;8
 """
+NINE = "1,2,3,4,5,6,7,8,9"
 NOISE = "noise: {x: 5 um, y: 5 um, z: 5 um}"
 READINGS = """format: 1
 delimiter: semicolon
@@ -211,3 +213,23 @@ def test_needed_column_that_occurs_twice_is_refused(tmp_path) -> None:
             .replace("U(95) X", "Y [mm]", 1)
             .replace("U(95) Y", "U(95) X;U(95) Y", 1),
         )
+
+
+@pytest.mark.parametrize(
+    ("name", "export"),
+    [
+        ("leica", "// name x y z\nP007_SMR1 1 2 3 9.5\nP007_SMR2 4 5 6 9.5\nP007_SMR3 7 8 9 9.5\n"),
+        ("faro", "Name,X,Y,Z\n7_SMR1,1,2,3\n7_SMR2,4,5,6\n7_SMR3,7,8,9\n"),
+        ("spatial-analyzer", "A,G,7_SMR1,1,2,3\nA,G,7_SMR2,4,5,6\nA,G,7_SMR3,7,8,9\n"),
+        ("wide", f"Name,{','.join(f'SMR{i} {c}' for i in (1, 2, 3) for c in 'XYZ')}\n7,{NINE}\n"),
+    ],
+)
+def test_shipped_profile_reads_its_export_and_assumes_the_noise(
+    tmp_path, monkeypatch, name, export
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "export.txt").write_text(export)
+    assert main(["import", "export.txt", "--profile", name, "-o", "data.csv"]) == 0
+    lines = (tmp_path / "data.csv").read_text().splitlines()
+    assert lines[-1] == f"7,{NINE}"
+    assert "# noise_source: assumed" in lines  # nobody gave 15 um, so no quality gate may use it
