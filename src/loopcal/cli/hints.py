@@ -60,6 +60,7 @@ def word_hint(finding: Finding, hint: str | None) -> str | None:
     is_useless = (
         (code == "prior.rows-reused" and not data["others"])  # no row would be left
         or (code == "prior.machine-changed" and data["subject"] != MACHINE)  # free already
+        or (code == "files.base-moves" and data["keeps"] not in ("both", "turn"))  # kept already
     )
     if hint is None or is_useless:
         return None
