@@ -442,7 +442,9 @@ def test_values_that_turn_the_base_frame_are_named_and_others_keep_it(capsys) ->
     assert run("export run --format reprap -o new.g --force") in (0, 2)
     assert "These values turn all of a program by 1." in " ".join(capsys.readouterr().out.split())
     assert run("export run --format reprap -o kept.g --keep-frame --force") in (0, 2)
-    assert "all values of this robot move" in " ".join(capsys.readouterr().out.split()).lower()
+    told = " ".join(capsys.readouterr().out.split())
+    assert "All values of this robot move programs" in told
+    assert "--keep-frame" not in told
     targets = 1e-3 * np.array([[x, y, 0.0] for x, y in POINTS])
     readings, turns, heights = inverse(robot, targets).q, [], []
     for name in ("new", "kept"):
