@@ -128,7 +128,7 @@ def test_unmet_quality_gate_gives_exit_code_2_and_keeps_the_run(loopcal, tmp_pat
     words = f"{CALIBRATE} --force --limit-position"
     loopcal(f"{words} 0.02mm --limit-angle 0.01deg --hold-out 0.25")
     # few fitted poses, so that the errors exceed the noise: below it, a limit stays open
-    said = "quality gate not met: Largest position error of 32"
+    said = "quality gate not met: Largest of 32 position errors"
     loopcal(f"{words} 0.1um --hold-out 0.8", said, code=2)
     assert (tmp_path / "run" / "result.json").exists()
 
