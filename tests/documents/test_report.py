@@ -256,6 +256,14 @@ def test_a_report_of_a_run_draws_the_decision_on_its_limit(root, tmp_path) -> No
     assert re.search("largest position error [^<]*, limit 20 um: conforms<", page)
 
 
+def test_first_screen_leaves_the_conditions_of_accuracy_to_the_report(calibration, page) -> None:
+    screen = str(calibration)
+    assert "simultaneously" in screen
+    for words in ("k = 1", "Compared:", "of platform coordinates"):
+        assert words not in screen
+        assert words in page.read_text()
+
+
 def test_errors_below_a_tenth_of_a_millimeter_are_in_micrometers(run) -> None:
     record = load_record(run)
     volume = {**record.result["volume"], "simultaneous": 1.79e-5}

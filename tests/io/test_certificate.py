@@ -218,7 +218,7 @@ def test_certificate_follows_the_schema_and_states_the_run(tmp_path, run) -> Non
     assert limit.startswith(judged["text"])
     assert content["fit"]["interval_note"] in verdict
     stated = content["volume"]
-    assert volume == stated["findings"][0]["text"]
+    assert volume == " ".join(f["text"] for f in stated["findings"][:2])  # bound and conditions
     assert limit_of_volume in [f["text"] for f in stated["findings"]]
     bounds = {read_text(q, "dcc:name/dcc:content"): q for q in quantities}
     for name in ("simultaneous", "pointwise"):

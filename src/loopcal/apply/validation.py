@@ -24,7 +24,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from loopcal.apply.calibration_options import check_limit
-from loopcal.apply.conformity import Conformity, judge_limits, report_conformity
+from loopcal.apply.conformity import Conformity, judge_limits, report_conformity, show_number
 from loopcal.diagnose.blunders import Blunder, Explanation, check_held_out_rows, name_blunders
 from loopcal.diagnose.conventions.convention_check import find_moved_setups
 from loopcal.diagnose.measured_points import report_base_targets
@@ -45,7 +45,7 @@ from loopcal.estimate.fit_linearization import FitUncertainty, collect_uncertain
 from loopcal.estimate.posterior import ModelDiscrepancy
 from loopcal.estimate.residual_test import SIGMA_AS_STATED, NoiseKnowledge
 from loopcal.estimate.result import Identification
-from loopcal.findings import Finding, Quantity, Severity, report_finding
+from loopcal.findings import Finding, Severity, report_finding
 from loopcal.findings.wording import list_names
 from loopcal.measure.data_checks import check_actuators, check_types
 from loopcal.measure.fitted_rows import FittedRows
@@ -571,10 +571,7 @@ def _report_blunders(
     for quantity, unit in errors.units.items():
         every, without = (e.after.statistics(quantity).rms for e in (errors, rest))
         if every > DOMINATES * without or np.isnan(without):
-            error, left = (
-                None if np.isnan(x) else Quantity(x / unit.factor_to_si, unit.symbol)
-                for x in (every, without)
-            )
+            error, left = (None if np.isnan(x) else show_number(x, unit) for x in (every, without))
             stated: dict[str, Any] = {"poses": poses, "quantity": quantity, "error": error}
             code = "validation.blunders-dominate"
             return [*findings, report_finding(code, **stated, without=left)]
@@ -598,7 +595,7 @@ def _find_largest(blunders: Sequence[Blunder], errors: Validation) -> list[dict[
             for i in of_row[row]:
                 if size > worst[i] * floor:
                     worst[i] = size / floor
-                    error = Quantity(size / unit.factor_to_si, unit.symbol)
+                    error = show_number(size, unit)
                     results[i] = {"quantity": quantity, "target": target, "error": error}
     return results
 

@@ -51,6 +51,7 @@ from loopcal.typing import FloatArray
 from loopcal.units import Dimension, parse_quantity
 
 LENGTH = Dimension.LENGTH
+CONDITIONS = "accuracy.volume-conditions"  # code of what reports add to the bound
 DRAWS = 4000  # of the posterior
 REFINED = 0.01  # share by which a fine grid still changes the largest error
 MOST_POINTS = 4096  # of a grid
@@ -341,7 +342,7 @@ def bound_errors(
         "repeatability_stated": bool(posterior.repeatability.any()),
         **reference.data,
     }
-    findings = [report_finding("accuracy.volume", points=n, **words)]
+    findings = [report_finding(of, points=n, **words) for of in ("accuracy.volume", CONDITIONS)]
     if grid.reachable < 1.0:
         reach = {"reachable": grid.reachable, "reason": grid.reason}
         findings.append(report_finding("accuracy.volume-reach", points=n, **reach))

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from loopcal.apply.error_budget import LENGTHS, Source
+from loopcal.apply.volume_accuracy import CONDITIONS
 from loopcal.diagnose.fit_examination import ROUNDING
 from loopcal.diagnose.row_errors import METRICS, SUMMARY
 from loopcal.estimate.result import LAST_DIGITS, Identification
@@ -129,7 +130,8 @@ def view_calibration(
     task: list[Block] = []
     if report.budget is not None and report.states_expected_error:
         task = ["", str(report.budget if verbose else report.budget.summary)]
-    task += [] if report.volume is None else [str(f) for f in report.volume.findings]
+    told = () if report.volume is None else report.volume.findings
+    task += [str(f) for f in told if f.code != CONDITIONS]
     blocks: list[Block] = [report.headline, *task]
     if report.validation is not None:
         blocks += view_errors(report.validation, "held-out")
