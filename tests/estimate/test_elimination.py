@@ -293,6 +293,9 @@ def test_cost_of_planes_that_share_a_probe_is_linear_in_their_number(monkeypatch
         assert counted["widest"] == 3 + 3 + 42 + 1
         assert own is not None
         assert int(own.elimination.tree.width.max()) == 6
+        root = own.elimination.list_root()
+        assert root.values.shape == (3 * groups + 3, 6)  # no plane has a part in another one
+        assert_allclose(root.fill(np.arange(3 * groups + 3)), own.elimination.joint_root())
         result.append((counted["rows"], counted["kept"]))
     one, two, four = np.array(result)
     assert (four - two == 2 * (two - one)).all()

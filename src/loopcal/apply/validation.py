@@ -52,6 +52,7 @@ from loopcal.measure.fitted_rows import FittedRows
 from loopcal.measure.kinds.kind import SCALES
 from loopcal.measure.measurements import Measurements
 from loopcal.mechanism.model import Mechanism
+from loopcal.numerics.elimination import UnknownRoot
 from loopcal.numerics.statistics import compute_f_quantile, find_distinct
 from loopcal.results.description import Field, fields
 from loopcal.results.result import DrawnResult
@@ -533,10 +534,11 @@ def _find_unpredicted(
     after, setup, places = compared.after, compared.after.setup, {}
     if uncertainty is not None:
         places = {name: i for i, name in enumerate(uncertainty.names) if name in after.kept}
-    root = np.zeros((len(setup), 0 if uncertainty is None else uncertainty.root.shape[1]))
-    for i, name in enumerate(setup.table.names):
-        if uncertainty is not None and name in places:
-            root[i] = uncertainty.root[places[name]] / uncertainty.noise_scale
+    root = UnknownRoot.make_empty(len(setup))
+    if uncertainty is not None and places:
+        known = [places.get(name, -1) for name in setup.table.names]
+        root = uncertainty.root.take(np.array(known))
+        root = root._replace(values=root.values / uncertainty.noise_scale)
     sizes = after.setup_deviations(compared.data.observations, root)
     is_open, poses = [of_kind > SETUP_KNOWN for of_kind in sizes], dict[str, None]()
     is_used = np.zeros((2, len(setup)), dtype=bool)  # by others, and by these rows

@@ -263,7 +263,7 @@ class Predictor(NamedTuple):
     def _count_own(self) -> int:
         """Return the number of variables that move nuisance parameters at a known machine."""
         fit = self.uncertainty
-        return len(self.unknown) + (0 if fit is None else fit.root.shape[1])
+        return len(self.unknown) + (0 if fit is None else fit.root.total)
 
     def _predict(self, names: tuple[str, ...]) -> FloatArray:
         """Return the derivative (U + p + m, p + m) of nuisance parameters, free parameters and the
@@ -291,17 +291,17 @@ class Predictor(NamedTuple):
         """Return the numbers (U, e) of the other variables that move each nuisance parameter at a
         known machine, -1 for none, and the derivatives (U, e) by these.
         """
-        fit, listed = self.uncertainty, []
+        fit, listed, unknown = self.uncertainty, [], {n: i for i, n in enumerate(self.unknown)}
         places = {} if fit is None else {name: i for i, name in enumerate(fit.names)}
         for name, dimension in zip(names, dimensions, strict=True):
-            row, first = np.zeros(0), 0 if fit is None else fit.root.shape[1]
+            row, columns = np.zeros(0), np.zeros(0, dtype=int)
             if fit is not None and name in self.kept and name in places:
-                row, first = fit.root[places[name]], 0
+                row, columns = fit.root.values[places[name]], fit.root.columns[places[name]]
             elif name in self.unknown:
                 unit = self.robot.size if dimension is Dimension.LENGTH else 1.0
-                row, first = np.array([ANYWHERE * unit]), first + self.unknown.index(name)
-            used = np.flatnonzero(row)
-            listed.append((first + used, row[used]))
+                first = 0 if fit is None else fit.root.total
+                row, columns = np.array([ANYWHERE * unit]), first + np.array([unknown[name]])
+            listed.append((columns[row != 0.0], row[row != 0.0]))
         widest = max((len(used) for used, _ in listed), default=0)
         numbers, root = np.full((len(names), widest), -1), np.zeros((len(names), widest))
         for i, (used, row) in enumerate(listed):

@@ -35,6 +35,7 @@ from loopcal.measure.readings import list_sensed_joints, select_joint_values
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import read_coordinates
 from loopcal.mechanism.solutions import Solution, inverse, make_solution
+from loopcal.numerics.elimination import UnknownRoot
 from loopcal.numerics.statistics import (
     NEAR_ONE,
     compute_chi_square_quantile,
@@ -428,13 +429,13 @@ class PosePredictions:
         return differences
 
     def setup_deviations(
-        self, observations: Sequence[Observations], root: FloatArray
+        self, observations: Sequence[Observations], root: UnknownRoot
     ) -> list[FloatArray]:
-        """Return how far the setup parameters with a square root (U, w) [SI] of their covariance
+        """Return how far the setup parameters with a square root [SI] of their covariance
         move the predictions (r,) of every kind, in standard deviations of its noise; 0 where that
         is rounding beside what each of them does by itself.
         """
-        alone = np.linalg.norm(root, axis=1)
+        alone = np.linalg.norm(root.values, axis=1)
         sizes = []
         for i, o in enumerate(observations):
             by_setup = o.evaluate(self.T, *self._inputs_of(i, o)).nuisance
@@ -448,8 +449,7 @@ class PosePredictions:
             order = np.argsort(set_of.ravel(), kind="stable")
             parts = np.split(order, np.cumsum(np.bincount(set_of.ravel()))[:-1])
             for own, mine in zip(sets, parts, strict=True):
-                part = root[own][:, root[own].any(axis=0)]  # of its session
-                together[mine] = np.linalg.norm(moved[mine] @ part, axis=(1, 2))
+                together[mine] = np.linalg.norm(moved[mine] @ root.fill(own), axis=(1, 2))
             most = np.linalg.norm(moved * alone[used][:, None], axis=(1, 2))
             sizes.append(np.where(together > SMALLEST_EFFECT * most, together, 0.0))
         return sizes

@@ -39,7 +39,7 @@ from loopcal.measure.array_checks import drop_repeats, take_rows
 from loopcal.measure.measurements import Measurements
 from loopcal.mechanism.model import Mechanism
 from loopcal.numerics.decomposition import Decomposition
-from loopcal.numerics.elimination import eliminate_columns, spread_columns
+from loopcal.numerics.elimination import UnknownRoot, eliminate_columns, spread_columns
 from loopcal.numerics.statistics import find_distinct
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
@@ -176,7 +176,7 @@ def linearize_at_estimate(
 UNKNOWN = 1e6
 """Standard deviation in `unit` that stands for a direction of which nothing is known."""
 
-SLOPE, ROOT = "local_slope", "local_root"
+SLOPE, ROOT, COLUMNS = "local_slope", "local_root", "local_columns"
 """Arrays of a run folder."""
 
 
@@ -184,14 +184,14 @@ class FitUncertainty(NamedTuple):
     """Free parameters and nuisance parameters of a fit with their joint uncertainty.
 
     posterior : of the machine. names : (U,) nuisance parameters.
-    slope : (U, p) S [SI / SI]. root : (U, w) T [SI], see `NuisanceEstimate`.
+    slope : (U, p) S [SI / SI]. root : T [SI], see `NuisanceEstimate`.
     noise_scale : factor on the stated sigmas of the rows. noise : what the fit says of other rows.
     """
 
     posterior: Posterior
     names: tuple[str, ...]
     slope: FloatArray
-    root: FloatArray
+    root: UnknownRoot
     noise_scale: float
     noise: NoiseKnowledge
 
@@ -228,11 +228,10 @@ class FitUncertainty(NamedTuple):
 def collect_uncertainty(fit: Identification) -> FitUncertainty:
     """Return the joint uncertainty of a fit."""
     nuisance = fit.nuisance
-    root = np.nan_to_num(nuisance.root, posinf=0.0)
     slope = nuisance.slope / fit.tolerance
     scale = np.nan_to_num(fit.residual_test.sigma_scale, nan=1.0)
     noise = NoiseKnowledge.of(fit.residual_test)
-    return FitUncertainty(fit.posterior, nuisance.names, slope, root, float(scale), noise)
+    return FitUncertainty(fit.posterior, nuisance.names, slope, nuisance.root, float(scale), noise)
 
 
 def uncertainty_from_arrays(
@@ -246,7 +245,8 @@ def uncertainty_from_arrays(
     arrays of a run folder. Raises as `posterior_from_arrays`.
     """
     posterior = posterior_from_arrays(robot, arrays)
-    return FitUncertainty(posterior, names, arrays[SLOPE], arrays[ROOT], noise_scale, noise)
+    root = UnknownRoot.of(arrays[COLUMNS], arrays[ROOT])
+    return FitUncertainty(posterior, names, arrays[SLOPE], root, noise_scale, noise)
 
 
 # The sources of the noise of a kind: the number (r,) of the source of each row, and the root

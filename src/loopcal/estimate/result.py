@@ -43,6 +43,7 @@ from loopcal.measure.measurements import Measurements
 from loopcal.measure.nuisance import choose_setup_unit
 from loopcal.mechanism.model import Mechanism
 from loopcal.numerics.decomposition import Decomposition, are_nonzero
+from loopcal.numerics.elimination import UnknownRoot
 from loopcal.numerics.gauss_newton import DescentStatus
 from loopcal.parameters import ParameterTable
 from loopcal.results.deferred import DeferredFields, deferred, later
@@ -558,7 +559,7 @@ class Identification(DeferredFields, TableResult):
             )
         ]
 
-    def arrays(self) -> dict[str, FloatArray]:
+    def arrays(self) -> dict[str, np.ndarray]:
         """Return the arrays of the run folder by name [SI]."""
         return {
             "nominal": self.nominal,
@@ -573,7 +574,8 @@ class Identification(DeferredFields, TableResult):
             "local_sd": self.nuisance.sd,
             "local_start": self.nuisance.start,
             "local_slope": self.nuisance.slope / self.tolerance,
-            "local_root": np.nan_to_num(self.nuisance.root, posinf=0.0),
+            "local_root": self.nuisance.root.values,
+            "local_columns": self.nuisance.root.columns,
             **self.posterior.arrays(),
             **({} if self.poses is None else self.poses.arrays()),
             **store_residuals(self.residuals),
@@ -703,7 +705,7 @@ class NuisanceEstimate(TableResult):
     sd : standard deviations; infinite where the data do not determine the parameter, 0 where it is
         fixed, NaN without an interval.
     slope : (U, p) change of the best values by the machine's deviations in tolerances.
-    root : (U, U + d) square root of their covariance at a known machine, NaN without intervals;
+    root : square root (U, U + d) of their covariance at a known machine, empty without intervals;
         its last columns are the d directions that no row determines, with `UNDETERMINED`.
     is_unobservable : (U,) parameters with a part in a direction that no row determines, whatever
         the machine.
@@ -717,7 +719,7 @@ class NuisanceEstimate(TableResult):
     estimate: FloatArray
     sd: FloatArray
     slope: FloatArray
-    root: FloatArray
+    root: UnknownRoot
     is_unobservable: BoolArray
     display: tuple[tuple[float, str], ...]
     is_harmless: bool = False
@@ -761,7 +763,7 @@ class NuisanceEstimate(TableResult):
     def empty(cls, parameters: int) -> NuisanceEstimate:
         """Return the estimate of no nuisance parameters at all, for p parameters."""
         nothing, slope = np.zeros(0), np.zeros((0, parameters))
-        root, is_unobservable = np.zeros((0, 0)), np.zeros(0, dtype=bool)
+        root, is_unobservable = UnknownRoot.make_empty(0), np.zeros(0, dtype=bool)
         return cls(ParameterTable(()), nothing, nothing, nothing, slope, root, is_unobservable, ())
 
     @property
@@ -784,7 +786,8 @@ class NuisanceEstimate(TableResult):
         nothing in them was estimated. The noise among the parts of the machine's posterior is also
         that of the setup parameters at a known machine; `tolerance` (p,) [SI].
         """
-        own = np.nan_to_num((self.root[:, : len(self)] ** 2).sum(axis=1))
+        is_own = self.root.columns < len(self)
+        own = np.sum(self.root.values**2, axis=1, where=is_own)
         squares = []
         for part in parts:
             by_machine = ((self.slope @ (part.root / tolerance[:, None])) ** 2).sum(axis=1)
@@ -857,11 +860,12 @@ def estimate_nuisance(
     if linearization.nuisance is None or not np.isfinite(linearization.cost[0]):
         estimate, nothing = linearization.next_start.nuisance[0].copy(), np.zeros(U)
         unobservable = np.zeros(U, dtype=bool)
-        slope, root = np.zeros((U, p)), np.full((U, U), np.nan)
+        slope, root = np.zeros((U, p)), UnknownRoot.make_empty(U)
         return NuisanceEstimate(table, begin, estimate, nothing, slope, root, unobservable, shown)
     done, is_free = linearization.nuisance.elimination, nuisance.is_free
     V = decomposition.directions[0]
-    slope, is_unobservable = done.slope[0], done.is_unobservable[0]
+    slope, is_unobservable, root = done.slope[0], done.is_unobservable[0], done.list_root()
+    root = root._replace(values=np.nan_to_num(root.values * np.sqrt(noise), posinf=0.0))
     moved = slope[is_free] @ V
     unknown = np.isinf(variance)
     moved_by_unknown = np.linalg.norm(moved[:, unknown], axis=1)
@@ -884,7 +888,7 @@ def estimate_nuisance(
         linearization.nuisance.best[0],
         np.sqrt(square),
         slope,
-        np.hstack([done.joint_root() * np.sqrt(noise), UNDETERMINED * done.null_directions()]),
+        root.append(UNDETERMINED * done.null_directions()),
         is_unobservable,
         shown,
         count <= {0: 3, 1: 1}.get(rotations, 0)

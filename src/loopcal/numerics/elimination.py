@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import permutations
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
@@ -295,6 +295,52 @@ class NodeFactors:
         return total
 
 
+class UnknownRoot(NamedTuple):
+    """A square root of the covariance of U unknowns by its entries that are not zero: those of an
+    unknown are few, because those of one session never meet those of another.
+    """
+
+    columns: IntArray  # (U, w) their columns, -1 for none
+    values: FloatArray  # (U, w)
+    total: int  # number of columns
+
+    @classmethod
+    def make_empty(cls, count: int) -> UnknownRoot:
+        """Return the root of so many unknowns without a column."""
+        return cls(np.zeros((count, 0), dtype=np.int64), np.zeros((count, 0)), 0)
+
+    @classmethod
+    def of(cls, columns: IntArray, values: FloatArray) -> UnknownRoot:
+        """Return a root whose columns, which have any numbers from 0 on, are counted."""
+        numbers, place = np.unique(np.append(-1, columns), return_inverse=True)
+        first = int((numbers < 0).sum())
+        return cls(place[1:].reshape(columns.shape) - first, values, len(numbers) - first)
+
+    def append(self, others: FloatArray) -> UnknownRoot:
+        """Return the root with further columns (U, d)."""
+        widest = int((others != 0.0).sum(axis=1).max(initial=0))
+        order = np.argsort(others == 0.0, axis=1, kind="stable")[:, :widest]
+        values = np.take_along_axis(others, order, axis=1)
+        columns = np.where(values != 0.0, self.total + order, -1)
+        return UnknownRoot(
+            np.hstack([self.columns, columns]),
+            np.hstack([self.values, values]),
+            self.total + others.shape[1],
+        )
+
+    def take(self, rows: IntArray) -> UnknownRoot:
+        """Return the root of some unknowns (k,), of which -1 is known."""
+        columns = np.where(rows[:, None] < 0, -1, self.columns[rows])
+        return UnknownRoot(columns, np.where(columns < 0, 0.0, self.values[rows]), self.total)
+
+    def fill(self, rows: IntArray) -> FloatArray:
+        """Return some rows (k, c), with the columns that any of them has."""
+        used, place = np.unique(self.columns[rows], return_inverse=True)
+        filled = np.zeros((len(rows), len(used)))
+        np.put_along_axis(filled, place.reshape(len(rows), -1), self.values[rows], axis=1)
+        return filled[:, used >= 0]
+
+
 @dataclass(frozen=True, eq=False)
 class NodeSolution:
     """Nodes of one structure after their elimination: x = -solution @ [ancestors, z, 1].
@@ -371,6 +417,17 @@ class TreeElimination(TrialBatch):
         unit = np.zeros((self.shift.shape[1], len(chosen)))
         unit[chosen, np.arange(len(chosen))] = 1.0
         return self.move_unknowns(unit)[chosen]
+
+    def list_root(self) -> UnknownRoot:
+        """Return `joint_root` by its entries: an unknown has those of its path."""
+        widest = max((structure.width for structure in self.tree.structures), default=0)
+        columns = np.full((self.shift.shape[1], widest), -1)
+        values = np.zeros(columns.shape)
+        for structure, root in zip(self.tree.structures, self.roots, strict=True):
+            u, w = structure.unknowns.shape[1], structure.width
+            columns[structure.unknowns, :w] = structure.path[:, None]
+            values[structure.unknowns, :w] = root[0, :, :u]
+        return UnknownRoot(columns, values, len(columns))
 
     def move_unknowns(self, x: FloatArray) -> FloatArray:
         """Return the root of `joint_root` times x (U, c)."""

@@ -289,6 +289,7 @@ FORMS: Mapping[str, str] = {
     "local_sd": "number u",
     "local_slope": "finite u p",
     "local_root": "finite u e",
+    "local_columns": "whole u e",
     "posterior_unit": "finite p",
     "posterior_directions": "finite p p",
     "posterior_variance": "number p",
