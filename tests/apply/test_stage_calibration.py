@@ -103,9 +103,9 @@ def test_targets_on_an_unknown_stage_are_refused() -> None:
     robot = load_cached_robot("excavator")
     poses = sample_workspace(robot, 2, seed=1).coordinates
     instrument = Instrument((Sensor(Position(of="bom"), Gaussian(np.full(3, 1e-4))),))
-    with pytest.raises(DataError, match="no stage 'bom'"):
+    with pytest.raises(DataError, match="no stage or body 'bom'"):
         simulate(robot, poses, instrument, 1)
-    with pytest.raises(DataError, match="it is not a chain"):
+    with pytest.raises(DataError, match="it has none beside the platform"):
         simulate(load_cached_robot("3-prs"), np.array([[0.7, 0.0, 0.0]]), instrument, 1)
 
 

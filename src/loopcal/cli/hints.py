@@ -66,6 +66,8 @@ def word_hint(finding: Finding, hint: str | None) -> str | None:
         return None
     if "--platform LINK" in hint and data.get("links"):
         return hint.replace("--platform LINK", name_options("--platform", data["links"][:1]))
+    if code == "files.groups-in-plan" and data["kind"] in ("plane", "line"):
+        return "use --measure plane-line"
     if code in ("workflow.next-check-outliers", "outliers.all-poses"):
         poses = [str(label).removeprefix("pose ") for label in data["poses"]]
         return f"use {name_options('--drop', poses)}, or --loss huber"

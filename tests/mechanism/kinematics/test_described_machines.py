@@ -411,10 +411,7 @@ def test_copied_legs_of_a_stage_grow_on_a_geared_trunnion(tmp_path: Path) -> Non
 
 @pytest.mark.parametrize(
     ("text", "old", "new", "sentence"),
-    [
-        (WINCHES, "  pay:", "  w:", "coupling 'w' has the name 'w1' of another row"),
-        (PULLEYS, "name: wire, at", "name: tip, at", "'cable1' has two elements 'tip'"),
-    ],
+    [(WINCHES, "  pay:", "  w:", "coupling 'w' has the name 'w1' of another row")],
 )
 def test_names_that_mean_two_things_are_refused(tmp_path, text, old, new, sentence) -> None:
     text = text.replace("of: pulley,", "of: tip,")

@@ -81,13 +81,10 @@ class PlacedLimb(NamedTuple):
         return (*(link.name for link in self.limb.links), self.limb.attachment.name)
 
     def find_element(self, name: str) -> str:
-        """Return a link by name; a joint of several axes means its first."""
+        """Return a link by name; a joint of several axes means its first, and a joint called as the
+        end of its chain is meant before that end.
+        """
         for candidate in (name, f"{name}.1", f"{name}.turn"):
-            if self.elements.count(candidate) > 1:
-                raise MechanismError(
-                    f"limb {self.name!r} has two elements {candidate!r}: one is the end of its "
-                    "chain. Rename the joint"
-                )
             if candidate in self.elements:
                 return candidate
         raise MechanismError(
