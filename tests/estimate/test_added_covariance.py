@@ -121,7 +121,7 @@ def test_poses_setup_parameters_and_a_later_prior_contain_the_addition():
         added.nuisance.sd**2, fit.nuisance.sd**2 + ((slope @ root) ** 2).sum(axis=1), rtol=1e-12
     )
     joint = collect_uncertainty(added)
-    own = (joint.root**2).sum(axis=1) + ((joint.slope @ joint.spread) ** 2).sum(axis=1)
+    own = (joint.root.values**2).sum(axis=1) + ((joint.slope @ joint.spread) ** 2).sum(axis=1)
     np.testing.assert_allclose(np.sqrt(own), added.nuisance.sd, rtol=1e-7)
     rows = prior_from(added.posterior).rows
     np.testing.assert_allclose(rows @ added.covariance @ rows.T, np.eye(len(rows)), atol=1e-7)

@@ -54,12 +54,9 @@ def render(
     times = step * fine
     every = cv2.resize(place.astype(np.float32), None, fx=times, fy=times)
     every = every[times : times + fine * size[1], times : times + fine * size[0]]
+    across, down = cv2.split(every)
     values = cv2.remap(
-        texture,
-        *cv2.split(every),
-        cv2.INTER_LINEAR,
-        borderMode=cv2.BORDER_CONSTANT,
-        borderValue=110,
+        texture, across, down, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=110
     )
     if blur > 0.0:
         values = cv2.GaussianBlur(values, (0, 0), blur * fine)
