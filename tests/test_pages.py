@@ -72,6 +72,22 @@ def test_every_page_with_commands_or_code_is_run_by_a_test(root) -> None:
     assert [name for name in find_theory(pages) if "```sh" in pages[name]] == []
 
 
+LOOKED_UP = {
+    *("README", "api", "coming-from", "commands", "engines", "evidence", "exports", "extending"),
+    *("files", "findings", "glossary", "papers", "python", "robots"),
+}
+"""Pages that are looked up; all others answer a question, and begin with a picture."""
+
+
+def test_pages_that_answer_a_question_begin_with_a_picture(root) -> None:
+    pages = {page.stem: page.read_text("utf-8") for page in (root / "docs").glob("*.md")}
+    assert pages.keys() > LOOKED_UP
+    for name in pages.keys() - LOOKED_UP:
+        match = re.search(r"!\[[^]]{20,}\]\(([^)]+)\)", pages[name][:900])
+        assert match is not None, name
+        assert (root / "docs" / match[1]).is_file(), name
+
+
 @pytest.mark.parametrize("page", OWN_TESTS)
 def test_test_file_of_a_page_names_it(page, root) -> None:
     text = (root / OWN_TESTS[page]).read_text("utf-8")

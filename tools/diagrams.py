@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Draw the diagrams of the documentation: docs/pictures/delta-geometry.png and frames.png.
+"""Draw the diagrams of docs/pictures: delta-geometry, frames and phone-and-board.
 
 python -m tools.diagrams
 """
@@ -100,17 +100,79 @@ def draw_towers(axes: Any, radius: float) -> None:
     axes.set(xlim=(-1.85 * radius, 1.85 * radius), ylim=(-1.5 * radius, 1.5 * radius))
 
 
+def draw_robot(axes: Any, robot: Any) -> None:
+    """Draw a robot at home [mm]."""
+    for part in list_parts(robot, robot.home_state):
+        points = 1e3 * part.points[0]
+        if part.role in ("base", "platform"):
+            axes.plot(*points.T, color=DARK, lw=4)
+        elif part.role in ("rod", "limb"):
+            axes.plot(*points.T, color=GREY, lw=6, solid_capstyle="round")
+
+
+def draw_board(axes: Any, T: Any, square: float) -> Any:
+    """Draw a board of 10 x 7 squares with its middle at a pose (4, 4) [mm]; return its corners."""
+    from mpl_toolkits.mplot3d.art3d import Poly3DCollection
+
+    corners = np.array([(0, 0), (1, 0), (1, 1), (0, 1)])
+    for i in range(10):
+        for j in range(7):
+            flat = np.add(corners, (i - 5, j - 3.5)) * square
+            places = T[:3, 3] + flat @ T[:3, :2].T
+            color = DARK if (i + j) % 2 else "white"
+            axes.add_collection3d(
+                Poly3DCollection([places], facecolor=color, edgecolor=DARK, lw=0.4)
+            )
+    ends = np.array([(-5, -3.5), (5, -3.5), (5, 3.5), (-5, 3.5)]) * square
+    return T[:3, 3] + ends @ T[:3, :2].T
+
+
+def draw_phone(axes: Any, place: Any, corners: Any) -> None:
+    """Draw a phone at a place that sees the corners of a board [mm]."""
+    target = np.mean(corners, axis=0)
+    ahead = np.subtract(target, place) / np.linalg.norm(np.subtract(target, place))
+    right = np.cross(ahead, (0.0, 0.0, 1.0))
+    right /= np.linalg.norm(right)
+    up = np.cross(right, ahead)
+    body = [place + 34 * x * right + 68 * y * up for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
+    axes.plot(*np.transpose([*body, body[0]]), color=BLUE, lw=4)
+    for corner in corners:
+        axes.plot(*np.transpose([place, corner]), color=ORANGE, lw=1.6, ls="--")
+    axes.text(*(place + 92 * up + 46 * right), "phone", fontsize=TEXT, color=BLUE)
+
+
+def draw_phone_and_board() -> Figure:
+    """Draw where phone and board are, on a hexapod, a delta and a five-bar."""
+    figure = Figure(figsize=(13.0, 4.9), facecolor="white")
+    for k, (name, title, square, away) in enumerate(
+        (
+            ("hexapod-42", "hexapod: at an angle", 17.0, (300.0, -230.0, 210.0)),
+            ("rotary-delta", "delta: tilted, from below", 17.0, (170.0, -120.0, -560.0)),
+            ("five-bar", "five-bar: tilted, from above", 17.0, (150.0, -260.0, 430.0)),
+        )
+    ):
+        robot = lc.load_robot(name)
+        axes: Any = figure.add_axes((0.005 + 0.332 * k, -0.06, 0.326, 1.02), projection="3d")
+        draw_robot(axes, robot)
+        T = np.array(robot.home)
+        T[:3, 3] *= 1e3
+        T[2, 3] += -14.0 if name == "rotary-delta" else 14.0
+        draw_phone(axes, T[:3, 3] + np.array(away), draw_board(axes, T, square))
+        figure.text(0.168 + 0.332 * k, 0.93, title, fontsize=TEXT, color=DARK, ha="center")
+        axes.set_aspect("equal")
+        axes.set_box_aspect(None, zoom=1.75)
+        axes.set_aspect("equal")
+        axes.view_init(elev=18 if name != "rotary-delta" else -14, azim=-62)
+        axes.set_axis_off()
+    return figure
+
+
 def draw_frames() -> Figure:
     """Draw the frames of base, platform, tool and tracker at a hexapod, and what joins them."""
     robot = lc.load_robot("hexapod-42")
     figure = Figure(figsize=(10.0, 6.2), facecolor="white")
     axes: Any = figure.add_axes((-0.16, -0.22, 1.3, 1.42), projection="3d")
-    for part in list_parts(robot, robot.home_state):
-        points = 1e3 * part.points[0]
-        if part.role == "rod":
-            axes.plot(*points.T, color=GREY, lw=6, solid_capstyle="round")
-        elif part.role in ("base", "platform"):
-            axes.plot(*points.T, color=DARK, lw=4)
+    draw_robot(axes, robot)
     platform = robot.home[:3, 3] * 1e3
     nest, tracker = platform + np.array([70.0, -60.0, 45.0]), np.array([560.0, -60.0, 120.0])
     turn = np.radians(35.0)
@@ -145,8 +207,10 @@ def draw_frames() -> Figure:
 
 def main() -> int:
     """Draw the diagrams."""
-    for name, figure in (("delta-geometry", draw_delta()), ("frames", draw_frames())):
-        save_picture(PICTURES / f"{name}.png", figure, 110)
+    drawn = {"delta-geometry": draw_delta, "frames": draw_frames}
+    drawn["phone-and-board"] = draw_phone_and_board
+    for name, draw in drawn.items():
+        save_picture(PICTURES / f"{name}.png", draw(), 110)
     return 0
 
 
