@@ -112,9 +112,8 @@ def compare_frames(fit):
     A = np.zeros((6, len(setup)))
     A[np.arange(6), places[6:]], A[np.arange(6), places[:6]] = 1.0, -1.0
     z = fit.covariance / np.outer(fit.tolerance, fit.tolerance)
-    return A @ setup.estimate, A @ (
-        setup.root @ setup.root.T + setup.slope @ z @ setup.slope.T
-    ) @ A.T
+    root = setup.root.fill(np.arange(len(setup)))
+    return A @ setup.estimate, A @ (root @ root.T + setup.slope @ z @ setup.slope.T) @ A.T
 
 
 @pytest.mark.parametrize("is_known", [True, False])
