@@ -80,6 +80,8 @@ AT_ONCE = {
 @pytest.mark.forks
 @pytest.mark.parametrize("words", AT_ONCE)
 def test_of_two_commands_that_write_the_same_at_once_one_is_told(loopcal, words) -> None:
+    if words.startswith("board"):
+        pytest.importorskip("cv2")  # which draws it
     before = {*Path().iterdir()}
     assert sorted(run_at_once(words.split(), 2)) == [0, 1]
     assert {str(path) for path in {*Path().iterdir()} - before} == AT_ONCE[words]
