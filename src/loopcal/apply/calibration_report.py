@@ -509,13 +509,9 @@ class CalibrationReport(DeferredFields, TableResult):
     @property
     def top_findings(self) -> tuple[Finding, ...]:
         """The two or three most important findings; all failures among them, none that says that
-        all is well, nor single combinations, which `report_freedoms` counts.
+        all is well, or that another one counts.
         """
-        notable = tuple(
-            f
-            for f in self.findings
-            if not find_entry(f.code).routine and f.code != "fit.unidentifiable"
-        )
+        notable = tuple(f for f in self.findings if not find_entry(f.code).routine)
         return notable[: max(TOP, len(self.failures))]
 
     def list_outliers(self, level: float = 1.0) -> tuple[str, ...]:

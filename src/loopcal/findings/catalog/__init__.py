@@ -5,7 +5,7 @@
     failure = "The iteration ..."      # severity = text, a template (`loopcal.findings.wording`)
     when = "Every shortened step ..."  # when it is reported, if the text does not say it
     action = "Check for wrong rows."   # what to do next, if the text does not say it
-    routine = true                     # said where all is well: left out of short pages
+    routine = true                     # left out of short pages, which need not say it
     example = { iterations = 12 }      # data of one case, for tests and documentation
 
 An example is needed where the text depends on its data, and where the data have more than the text
@@ -64,7 +64,7 @@ class Entry:
 
     code : `subject.what`. severity : how much it matters. text : the sentence, a template.
     when : when it is reported. action : what to do next. Both are empty where the text says it.
-    example : data of one case. routine : whether short pages leave it out, as all is well.
+    example : data of one case. routine : whether short pages leave it out.
     """
 
     code: str
