@@ -110,7 +110,7 @@ def draw_robot(axes: Any, robot: Any) -> None:
             axes.plot(*points.T, color=GREY, lw=6, solid_capstyle="round")
 
 
-def draw_board(axes: Any, T: Any, square: float) -> Any:
+def draw_board(axes: Any, T: Any, square: float = 17.0) -> Any:
     """Draw a board of 10 x 7 squares with its middle at a pose (4, 4) [mm]; return its corners."""
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
@@ -144,11 +144,11 @@ def draw_phone(axes: Any, place: Any, corners: Any) -> None:
 def draw_phone_and_board() -> Figure:
     """Draw where phone and board are, on a hexapod, a delta and a five-bar."""
     figure = Figure(figsize=(13.0, 4.9), facecolor="white")
-    for k, (name, title, square, away) in enumerate(
+    for k, (name, title, away) in enumerate(
         (
-            ("hexapod-42", "hexapod: at an angle", 17.0, (300.0, -230.0, 210.0)),
-            ("rotary-delta", "delta: tilted, from below", 17.0, (170.0, -120.0, -560.0)),
-            ("five-bar", "five-bar: tilted, from above", 17.0, (150.0, -260.0, 430.0)),
+            ("hexapod-42", "hexapod: at an angle", (300.0, -230.0, 210.0)),
+            ("rotary-delta", "delta: tilted, from below", (170.0, -120.0, -560.0)),
+            ("five-bar", "five-bar: tilted, from above", (150.0, -260.0, 430.0)),
         )
     ):
         robot = lc.load_robot(name)
@@ -157,9 +157,8 @@ def draw_phone_and_board() -> Figure:
         T = np.array(robot.home)
         T[:3, 3] *= 1e3
         T[2, 3] += -14.0 if name == "rotary-delta" else 14.0
-        draw_phone(axes, T[:3, 3] + np.array(away), draw_board(axes, T, square))
+        draw_phone(axes, T[:3, 3] + np.array(away), draw_board(axes, T))
         figure.text(0.168 + 0.332 * k, 0.93, title, fontsize=TEXT, color=DARK, ha="center")
-        axes.set_aspect("equal")
         axes.set_box_aspect(None, zoom=1.75)
         axes.set_aspect("equal")
         axes.view_init(elev=18 if name != "rotary-delta" else -14, azim=-62)

@@ -186,8 +186,8 @@ class Handler(RequestHandler):
 
 
 async def follow(project: Project, lock: asyncio.Lock) -> None:
-    """Give the companion the rows of an export as they come."""
-    while True:
+    """Give the companion the rows of an export as they come, if one is followed."""
+    while project.make_export is not None:
         await asyncio.sleep(POLL)
         async with lock:
             await asyncio.to_thread(project.follow)
