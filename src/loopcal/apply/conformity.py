@@ -35,7 +35,8 @@ import numpy as np
 
 from loopcal.diagnose.row_errors import PoseErrors
 from loopcal.errors import EstimationError
-from loopcal.findings import Finding, Quantity, report_finding
+from loopcal.findings import Finding, report_finding
+from loopcal.findings.wording import FINE
 from loopcal.measure.observations import Observations
 from loopcal.numerics.statistics import (
     compute_chi_square_quantile,
@@ -45,7 +46,7 @@ from loopcal.numerics.statistics import (
 )
 from loopcal.results.description import Field, fields
 from loopcal.results.result import Result
-from loopcal.results.tables import choose_unit
+from loopcal.results.tables import choose_unit, to_quantity
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension, Unit
 
@@ -145,6 +146,10 @@ class Conformity(Result):
         error = f"error {self.estimate:.4g} (95 %: {self.low:.4g} to {self.high:.4g})"
         decision = f"{self.decision.value} with a probability of {100.0 * self.probability:.3g} %"
         return f"{error} against a limit of {self.limit:.4g}, all in m or rad: {decision}"
+
+    def choose_unit(self, unit: Unit) -> Unit:
+        """Return the unit in which limit and uncertainty are read, of those finer than `unit`."""
+        return choose_unit(unit, [min(self.limit, self.expanded or self.limit)], FINE)
 
     @property
     def expanded(self) -> float:
@@ -323,7 +328,7 @@ def report_conformity(
             findings.append(report_decision(quantity, result, unit, **stated))
             continue
         code = "gates.limit-exceeded" if measured > limit else "gates.limit-kept"
-        stated |= {"limit": show_number(limit, unit), "error": show_number(measured, unit)}
+        stated |= {"limit": to_quantity(limit, unit), "error": to_quantity(measured, unit)}
         findings.append(report_finding(code, quantity=quantity, **stated))
     return findings
 
@@ -335,22 +340,17 @@ def report_decision(quantity: str, result: Conformity, unit: Unit, **measured: A
         of a volume.
     """
     if unit.dimension is Dimension.LENGTH:
-        unit = choose_unit(unit, [0.1 * min(result.limit, result.expanded or result.limit)])
+        unit = result.choose_unit(unit)
     stated = {"pose": "", "target": "", "error": None, **measured}
-    stated |= {"error": show_number(measured["error"], unit)} if measured else {}
+    stated |= {"error": to_quantity(measured["error"], unit)} if measured else {}
     return report_finding(
         f"conformity.{result.decision.name.lower()}",
         quantity=quantity,
         is_volume=not measured,
         **stated,
-        **{name: show_number(getattr(result, name), unit) for name in STATED},
+        **{name: to_quantity(getattr(result, name), unit) for name in STATED},
         **{name: getattr(result, name) for name in STATED_NUMBERS},
     )
-
-
-def show_number(number: float, unit: Unit) -> Quantity:
-    """Return a number in SI in a unit."""
-    return Quantity(float(number) / unit.factor_to_si, unit.symbol)
 
 
 def _check_level(level: float) -> None:

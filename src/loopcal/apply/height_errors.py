@@ -20,7 +20,6 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from loopcal.apply.conformity import show_number
 from loopcal.diagnose.row_errors import (
     PredictionComparison,
     Statistics,
@@ -41,6 +40,7 @@ from loopcal.numerics.statistics import compute_f_tail
 from loopcal.results.description import Field, fields
 from loopcal.results.result import DrawnResult
 from loopcal.results.storage import restore_arrays
+from loopcal.results.tables import to_quantity
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import Dimension, Unit
 
@@ -109,7 +109,7 @@ class HeightErrors(DrawnResult):
         n, before = len(self.poses), self.before
         mean, scatter, findings = float(before.mean()), float(before.std()), list[Finding]()
         if abs(mean) > max(SHIFTED, SHIFT_RATIO * scatter):
-            shift, rest = (show_number(length, self.unit) for length in (mean, scatter))
+            shift, rest = (to_quantity(length, self.unit) for length in (mean, scatter))
             findings.append(report_finding(SHIFT_UNDECIDED, shift=shift, rest=rest))
         centered = self.points - self.points.mean(axis=0)
         slope, _, rank, _ = np.linalg.lstsq(centered, before - mean)

@@ -24,7 +24,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from loopcal.apply.calibration_options import check_limit
-from loopcal.apply.conformity import Conformity, judge_limits, report_conformity, show_number
+from loopcal.apply.conformity import Conformity, judge_limits, report_conformity
 from loopcal.diagnose.blunders import Blunder, Explanation, check_held_out_rows, name_blunders
 from loopcal.diagnose.conventions.convention_check import find_moved_setups
 from loopcal.diagnose.measured_points import report_base_targets
@@ -57,6 +57,7 @@ from loopcal.numerics.statistics import compute_f_quantile, find_distinct
 from loopcal.results.description import Field, fields
 from loopcal.results.result import DrawnResult
 from loopcal.results.storage import restore
+from loopcal.results.tables import to_quantity
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import SI_SYMBOLS, Unit
 
@@ -573,7 +574,7 @@ def _report_blunders(
     for quantity, unit in errors.units.items():
         every, without = (e.after.statistics(quantity).rms for e in (errors, rest))
         if every > DOMINATES * without or np.isnan(without):
-            error, left = (None if np.isnan(x) else show_number(x, unit) for x in (every, without))
+            error, left = (None if np.isnan(x) else to_quantity(x, unit) for x in (every, without))
             stated: dict[str, Any] = {"poses": poses, "quantity": quantity, "error": error}
             code = "validation.blunders-dominate"
             return [*findings, report_finding(code, **stated, without=left)]
@@ -597,7 +598,7 @@ def _find_largest(blunders: Sequence[Blunder], errors: Validation) -> list[dict[
             for i in of_row[row]:
                 if size > worst[i] * floor:
                     worst[i] = size / floor
-                    error = show_number(size, unit)
+                    error = to_quantity(size, unit)
                     results[i] = {"quantity": quantity, "target": target, "error": error}
     return results
 

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from loopcal.apply.accuracy import BLOCK, PoseUncertainty, pose_uncertainty
-from loopcal.apply.conformity import Conformity, judge_draws, report_decision, show_number
+from loopcal.apply.conformity import Conformity, judge_draws, report_decision
 from loopcal.checks import check_choice
 from loopcal.diagnose.error_frames import (
     FITTED,
@@ -38,6 +38,7 @@ from loopcal.estimate.residual_test import LEVEL
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
 from loopcal.findings.catalog import word_phrase
+from loopcal.findings.wording import FINE
 from loopcal.measure.array_checks import check_array
 from loopcal.measure.instrument import make_random_stream
 from loopcal.mechanism.model import Mechanism
@@ -46,7 +47,7 @@ from loopcal.mechanism.solutions import Solution, forward, inverse
 from loopcal.mechanism.workspace import find_reachable
 from loopcal.results.description import Field, fields
 from loopcal.results.result import Result
-from loopcal.results.tables import choose_unit
+from loopcal.results.tables import choose_unit, to_quantity
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension, parse_quantity
 
@@ -333,10 +334,10 @@ def bound_errors(
     place = grid.points[int(drawn.pointwise.argmax())] + 0.0
     worst = dict(zip(robot.controlled, place.tolist(), strict=True))
     words, reference = volume.describe(robot), chosen.describe(axes="")
-    unit = choose_unit(robot.get_unit(LENGTH), [0.1 * pointwise])  # um below 0.1 mm
+    unit = choose_unit(robot.get_unit(LENGTH), [pointwise], FINE)
     words |= {
-        "simultaneous": show_number(simultaneous, unit),
-        "pointwise": show_number(pointwise, unit),
+        "simultaneous": to_quantity(simultaneous, unit),
+        "pointwise": to_quantity(pointwise, unit),
         "worst": _show(robot, {x: [at] for x, at in worst.items() if x not in words["at_home"]}),
         "refinement": None if math.isnan(refinement) else refinement,
         "repeatability_stated": bool(posterior.repeatability.any()),

@@ -793,8 +793,8 @@ def _print_assumed_sigma(instrument: lc.Instrument) -> None:
     """Print a note where the user states the noise of lengths or of angles, and the instrument
     measures both.
     """
-    from loopcal.findings.wording import Quantity
     from loopcal.measure.instrument import SIGMA
+    from loopcal.results.tables import to_quantity
 
     options = {"sigma_position": (Dimension.LENGTH, "length", "um"),
                "sigma_angle": (Dimension.ANGLE, "angle", "urad")}  # fmt: skip
@@ -802,7 +802,7 @@ def _print_assumed_sigma(instrument: lc.Instrument) -> None:
     measured = {c.dimension for sensor in instrument.sensors for c in sensor.kind.noise_columns}
     if len(assumed) == 1 and measured.issuperset((Dimension.LENGTH, Dimension.ANGLE)):
         dimension, name, unit = options[assumed[0]]
-        sigma = Quantity(SIGMA[dimension] / find_unit(unit).factor_to_si, unit)
+        sigma = to_quantity(SIGMA[dimension], find_unit(unit))
         terminal.print_finding("data.sigma-assumed", quantity=name, sigma=sigma)
 
 

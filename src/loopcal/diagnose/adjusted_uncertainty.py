@@ -58,9 +58,10 @@ from loopcal.estimate.fit_linearization import FitLinearization
 from loopcal.estimate.posterior import NOISE
 from loopcal.estimate.residual_test import FALSE_ALARMS, choose_severity
 from loopcal.estimate.result import Identification, add_covariance
-from loopcal.findings import Finding, Quantity, Severity, report_finding
+from loopcal.findings import Finding, Severity, report_finding
 from loopcal.measure.measurements import Measurements
 from loopcal.numerics.statistics import choose_evenly, compute_median, find_distinct
+from loopcal.results.tables import to_quantity
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import DISPLAY_UNITS, find_unit
 
@@ -201,7 +202,7 @@ def _report_shared(cause: Cause, ratio: float) -> Finding:
         SHARED,
         cause=cause.source,
         components=tuple(component for component, _ in sizes),
-        sizes=tuple(Quantity(sigma * sd / u.factor_to_si, u.symbol) for sd, u in shown),
+        sizes=tuple(to_quantity(sigma * sd, u) for sd, u in shown),
         ratio=ratio,
         p_value=cause.p_value,
         severity=cause.severity,
@@ -280,10 +281,7 @@ def _report_effect(effect: EffectSizes, ratio: float) -> Finding:
     most = int(np.argmax(np.abs(effect.sizes) / effect.errors))
     component, dimension = effect.effect.labels[most]
     unit = DISPLAY_UNITS[dimension]
-    size, error = (
-        Quantity(float(values[most]) / unit.factor_to_si, unit.symbol)
-        for values in (effect.sizes, effect.errors)
-    )
+    size, error = (to_quantity(values[most], unit) for values in (effect.sizes, effect.errors))
     source, name = effect.effect.source, effect.effect.name
     return report_finding(
         CODES[source],

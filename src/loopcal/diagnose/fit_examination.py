@@ -35,7 +35,7 @@ from loopcal.estimate.identification import identify
 from loopcal.estimate.penalties import LeastSquares
 from loopcal.estimate.residual_test import FEWEST_DEGREES, SIGNIFICANCE
 from loopcal.estimate.result import Identification
-from loopcal.findings import Finding, Quantity, report_finding
+from loopcal.findings import Finding, report_finding
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations
 from loopcal.mechanism.model import Mechanism
@@ -44,7 +44,7 @@ from loopcal.numerics.elimination import find_connected_groups
 from loopcal.numerics.statistics import compute_f_tail, find_distinct
 from loopcal.results.description import Field, fields
 from loopcal.results.result import Result
-from loopcal.results.tables import Block, choose_unit
+from loopcal.results.tables import Block, choose_unit, to_quantity
 from loopcal.typing import Progress, report_no_progress
 from loopcal.units import Dimension
 
@@ -145,7 +145,7 @@ def estimate_calibration_gain(
     is_worthwhile = any(before > GAIN * after for before, after in pairs.values() if before > 0.0)
     units = {d: choose_unit(fit.robot.get_unit(d), [min(pair)]) for d, pair in pairs.items()}
     position, orientation = (
-        tuple(Quantity(size / unit.factor_to_si, unit.symbol) for size in pairs[dimension])
+        tuple(to_quantity(size, unit) for size in pairs[dimension])
         if pairs[dimension][0] > 0.0
         else None
         for dimension, unit in units.items()

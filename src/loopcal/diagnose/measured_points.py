@@ -36,6 +36,7 @@ from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.solutions import forward
 from loopcal.numerics.decomposition import decompose, empty_factor
 from loopcal.numerics.statistics import compute_any_probability, compute_chi_square_tail
+from loopcal.results.tables import to_quantity
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import UNITS, Dimension, find_unit, list_symbols
 
@@ -339,8 +340,8 @@ class FrameDrift:
             rows=self.rows,
             shift=Quantity(1e3 * self.shift, "mm"),
             shift_sd=Quantity(1e3 * self.shift_sd, "mm"),
-            angle=Quantity(self.angle / arcsec.factor_to_si, arcsec.symbol),
-            angle_sd=Quantity(self.angle_sd / arcsec.factor_to_si, arcsec.symbol),
+            angle=to_quantity(self.angle, arcsec),
+            angle_sd=to_quantity(self.angle_sd, arcsec),
             p_value=self.p_value,
             tiny=self.p_value < TINY,
         )

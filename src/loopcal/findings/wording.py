@@ -42,15 +42,16 @@ FINER = {"m": ("mm", 1e3), "mm": ("um", 1e3), "um": ("nm", 1e3), "rad": ("mrad",
 FINER |= {"mrad": ("urad", 1e3), "deg": ("urad", 1e6 * math.pi / 180.0)}
 """Unit -> the next finer one, and its number of them."""
 
-SMALL = 0.01  # numbers below this are read in a finer unit: 7 um instead of 0.007 mm
+SMALL, FINE = 0.01, 0.1
+"""Numbers below which a finer unit is read, 7 um instead of 0.007 mm; and in what people sign."""
 
 
-def choose_symbol(size: float, symbol: str) -> tuple[str, float]:
+def choose_symbol(size: float, symbol: str, small: float = SMALL) -> tuple[str, float]:
     """Return the unit in which a number of this size is read, and how many of it make up `symbol`;
-    a size of 0 keeps its unit.
+    a size of 0 keeps its unit. small : see `SMALL`.
     """
     factor = 1.0
-    while symbol in FINER and 0.0 < round(abs(size) * factor, 12) < SMALL:  # 0.01 may be rounded
+    while symbol in FINER and 0.0 < round(abs(size) * factor, 12) < small:  # 0.01 may be rounded
         symbol, finer = FINER[symbol]
         factor *= finer
     return symbol, factor

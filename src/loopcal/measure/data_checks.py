@@ -15,7 +15,7 @@ import numpy as np
 
 from loopcal import geometry
 from loopcal.errors import DataError
-from loopcal.findings import Quantity, report_finding
+from loopcal.findings import report_finding
 from loopcal.measure.array_checks import check_type
 from loopcal.measure.kinds import CLOSURE
 from loopcal.measure.kinds.joints import JointSensor
@@ -30,6 +30,7 @@ from loopcal.measure.readings import (
 )
 from loopcal.mechanism.model import Mechanism
 from loopcal.numerics.statistics import compute_known_median, compute_median, find_distinct
+from loopcal.results.tables import to_quantity
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import DISPLAY_UNITS, find_unit
 
@@ -249,7 +250,7 @@ def check_targets_move(
             worst = int(np.argmax(np.where(moves, expected / static.noise, 0.0)))
             shown = DISPLAY_UNITS[kind.columns[static.columns[worst]].dimension]
             value, moved, planned = (
-                Quantity(float(number) / shown.factor_to_si, shown.symbol)
+                to_quantity(number, shown)
                 for number in (
                     rows.measured[static.present][0, static.columns[0]],
                     static.range[worst],

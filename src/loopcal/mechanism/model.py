@@ -32,6 +32,7 @@ from loopcal.mechanism.transmission import (
 from loopcal.parameters import ParameterTable
 from loopcal.results.description import Field, label_axes
 from loopcal.results.result import DrawnResult
+from loopcal.results.tables import to_quantity
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension, Unit, find_unit
 
@@ -344,8 +345,7 @@ class Mechanism(DrawnResult):
 
     def to_quantity(self, value: float, dimension: Dimension) -> Quantity:
         """Return a value [SI] in the unit in which it is shown."""
-        unit = self.get_unit(dimension)
-        return Quantity(value / unit.factor_to_si, unit.symbol)
+        return to_quantity(value, self.get_unit(dimension))
 
     @property
     def gap_scale(self) -> float:

@@ -15,7 +15,7 @@ from loopcal.diagnose.fit_examination import ROUNDING
 from loopcal.diagnose.row_errors import METRICS, SUMMARY
 from loopcal.estimate.result import LAST_DIGITS, Identification
 from loopcal.findings import Finding, Severity, report_finding
-from loopcal.findings.wording import add_advice, count_decimals, list_names, name_count
+from loopcal.findings.wording import FINE, add_advice, count_decimals, list_names, name_count
 from loopcal.report.validation_view import describe_improvements, view_error_statistics, view_errors
 from loopcal.report.words import say
 from loopcal.results.description import Field
@@ -374,7 +374,7 @@ def build_gum_tables(budget: Mapping[str, Any], robot: Mechanism) -> list[Table]
 
 def _build_gum_table(budget: Mapping[str, Any], robot: Mechanism, kind: str) -> Table:
     """Return one line for each source: its stated value, what it contributes, and their ratio."""
-    unit = choose_unit(robot.shown_units[LENGTHS[kind]], [0.1 * (budget[kind]["rms"] or 0.0)])
+    unit = choose_unit(robot.shown_units[LENGTHS[kind]], [budget[kind]["rms"]], FINE)
     rows = []
     for line in budget["sources"]:
         stated, error = line.get("stated"), math.sqrt(line[kind] or 0.0)

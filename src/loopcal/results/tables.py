@@ -13,7 +13,7 @@ from itertools import zip_longest
 from types import MappingProxyType
 from typing import Any, Literal, TypeVar
 
-from loopcal.findings.wording import choose_symbol, count_decimals, write_small
+from loopcal.findings.wording import SMALL, Quantity, choose_symbol, count_decimals, write_small
 from loopcal.plain_text import escape
 from loopcal.results.description import Field, look_up
 from loopcal.units import UNITS, Dimension, Unit
@@ -242,11 +242,18 @@ def format_in(unit: Unit, value: float, digits: int = 6) -> str:
     return write_small(format_number(float(value) / unit.factor_to_si, digits))
 
 
-def choose_unit(unit: Unit, values: Iterable[float | None]) -> Unit:
-    """Return the unit of a column of numbers [SI]: `unit`, or a finer one for the largest."""
+def to_quantity(number: float, unit: Unit) -> Quantity:
+    """Return a number [SI] in a unit."""
+    return Quantity(float(number) / unit.factor_to_si, unit.symbol)
+
+
+def choose_unit(unit: Unit, values: Iterable[float | None], small: float = SMALL) -> Unit:
+    """Return the unit of a column of numbers [SI]: `unit`, or a finer one for the largest, if it is
+    below `small`.
+    """
     sizes = [abs(x) / unit.factor_to_si for x in values if x is not None and math.isfinite(x)]
     largest = max(sizes, default=0.0)
-    return UNITS[choose_symbol(largest, unit.symbol)[0]] if largest >= ROUNDING else unit
+    return UNITS[choose_symbol(largest, unit.symbol, small)[0]] if largest >= ROUNDING else unit
 
 
 COARSER = {"nm": "um", "um": "mm", "urad": "mrad"}

@@ -16,7 +16,7 @@ from loopcal.apply.run_comparison import RunComparison
 from loopcal.engine import collect_versions
 from loopcal.errors import DataError, suggest_names
 from loopcal.findings import sort_by_importance
-from loopcal.findings.wording import list_names, name_count
+from loopcal.findings.wording import FINE, SMALL, list_names, name_count
 from loopcal.mechanism.model import Mechanism
 from loopcal.report import calibration_view, validation_view
 from loopcal.report.document import figures
@@ -142,9 +142,9 @@ def _list_results(record: CalibrationRecord) -> Iterator[tuple[str, ...]]:
     stated = list(_list_errors(record))
     units: dict[str, Unit] = {}
     for quantity, dimension in LENGTHS.items():
-        share = 0.1 if dimension is Dimension.LENGTH else 1.0
-        after = [share * abs(x) for _, of, _, x, _ in stated if of == quantity and x]
-        units[quantity] = choose_unit(record.robot.get_unit(dimension), [min(after, default=0.0)])
+        after = [min((abs(x) for _, of, _, x, _ in stated if of == quantity and x), default=0.0)]
+        small = FINE if dimension is Dimension.LENGTH else SMALL
+        units[quantity] = choose_unit(record.robot.get_unit(dimension), after, small)
     for words, quantity, before, after, judged in stated:
         limit = judged["limit"] if judged else None
         numbers = (

@@ -324,7 +324,7 @@ def draw_validation(validation: Validation) -> Figure:
 
 def _draw_decision(axes: Axes, quantity: str, conformity: Conformity, unit: Unit) -> None:
     """Draw the largest error with its interval on a line from accepted to rejected."""
-    unit = choose_unit(unit, [0.1 * min(conformity.limit, conformity.expanded or conformity.limit)])
+    unit = conformity.choose_unit(unit)
     ends = ("low", "estimate", "high", "limit", "acceptance_limit", "rejection_limit")
     low, error, high, limit, accepted, rejected = (
         getattr(conformity, end) / unit.factor_to_si for end in ends
