@@ -392,11 +392,14 @@ def read_bytes(path: str | Path, what: str, limit: FileLimit = PROGRAM_SIZE) -> 
     with open_bytes(path, what) as stream:
         size = os.fstat(stream.fileno()).st_size
         limit.check(size, what, path)
-        raw = stream.read(size + 1)
-        if raw is None:  # reading would wait, as in /proc/kmsg
-            raise BlockingIOError(errno.EAGAIN, os.strerror(errno.EAGAIN))
-        if len(raw) > size:  # the file grew, or the system does not state its size
-            raw += stream.read(limit.count + 1 - size) or b""
+        raw = b""
+        while len(raw) <= limit.count:  # the file may grow, or the system states no size
+            part = stream.read((limit.count if raw else size) + 1)
+            if part is None:  # reading would wait for more, as in /proc/kmsg
+                raise BlockingIOError(errno.EAGAIN, os.strerror(errno.EAGAIN))
+            if not part:
+                break
+            raw += part
     if len(raw) > limit.count:
         raise limit.make_error(what, path)
     return raw
