@@ -556,9 +556,6 @@ class ErrorBudget(DrawnResult):
     )
     LABELS: ClassVar[Mapping[str, Any]] = label_axes(source="lines.source.words", other="names")
 
-    def __str__(self) -> str:
-        return str(self.finding)
-
     @property
     def summary(self) -> Finding:
         """The errors of poses without their sources, in one sentence."""

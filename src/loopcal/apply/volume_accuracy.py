@@ -283,9 +283,6 @@ class VolumeAccuracy(Result):
         Field("conformity", is_optional=True),
     )
 
-    def __str__(self) -> str:
-        return "\n".join(map(str, self.findings))
-
 
 def bound_errors(
     fit: Identification | Posterior,

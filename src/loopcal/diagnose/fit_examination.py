@@ -358,7 +358,7 @@ class StartCheck:
 
 
 @dataclass(frozen=True)
-class StoredAnswer:
+class StoredAnswer(Result):
     """A stored geometry and the optimum of the firmware's cost, from the same probes."""
 
     stored: float  # its cost [mm^2]
@@ -377,9 +377,6 @@ class StoredAnswer:
         if self.is_optimum:
             return report_finding("residuals.stored-is-optimum", stored=self.stored, best=self.best)
         return report_finding("residuals.stored-not-optimum", **vars(self))
-
-    def __str__(self) -> str:
-        return str(self.finding)
 
 
 def check_start_values(fit: Identification) -> StartCheck:

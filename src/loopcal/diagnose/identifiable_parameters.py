@@ -453,9 +453,6 @@ class MeasurementSuggestion(Result):
             "identifiability.measure-also", names=names, measurements=measurements, poses=POSES
         )
 
-    def __str__(self) -> str:
-        return str(self.finding)
-
 
 def suggest_measurements(
     identifiability: Identifiability, sigma: dict[Dimension, float] | None = None
@@ -601,7 +598,7 @@ SETTABLE, NONZERO = 0.1, 0.3
 
 
 @dataclass(frozen=True, eq=False)
-class MergedParameter:
+class MergedParameter(Result):
     """A parameter that is fixed because others have the same effect."""
 
     # name, unit: of the parameter
@@ -622,9 +619,6 @@ class MergedParameter:
     def describe_effect(self, most: int = 8) -> str:
         """Return the effect in terms of at most `most` of the kept parameters."""
         return effect(vars(self), most)
-
-    def __str__(self) -> str:
-        return str(self.finding)
 
 
 @dataclass(frozen=True, eq=False)
@@ -654,9 +648,6 @@ class IdentifiableSubset(Result):
 
     def __repr__(self) -> str:
         return f"<IdentifiableSubset: {len(self.kept)} kept, {len(self.dropped)} fixed>"
-
-    def __str__(self) -> str:
-        return "\n".join(str(finding) for finding in self.findings)
 
 
 def choose_identifiable_subset(identifiability: Identifiability) -> IdentifiableSubset:

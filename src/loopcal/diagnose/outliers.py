@@ -544,9 +544,6 @@ class OutlierCheck(TableResult):
     def __repr__(self) -> str:
         return f"<OutlierCheck: {len(self.outliers)} of {self.blocks} blocks are outliers>"
 
-    def __str__(self) -> str:
-        return "\n".join(str(finding) for finding in self.findings)
-
 
 def find_outliers(
     fit: Identification,

@@ -229,10 +229,6 @@ class Combination(Result):
             nuisance=self.nuisance,
         )
 
-    def __str__(self) -> str:
-        """Return the text of the finding."""
-        return str(self.finding)
-
 
 def describe_null_space(free: FreeParameters, null_space: FloatArray) -> tuple[Combination, ...]:
     """Return the combinations that span a null space (p, d) of deviations in tolerances."""

@@ -81,9 +81,6 @@ class Change(Result):
         sentence=lambda change: str(change.finding),
     )
 
-    def __str__(self) -> str:
-        return str(self.finding)
-
 
 def recalibrate(
     robot: Mechanism,

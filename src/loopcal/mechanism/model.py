@@ -319,6 +319,8 @@ class Mechanism(DrawnResult):
             )
         )
 
+    __str__ = __repr__
+
     @property
     def name(self) -> str:
         """Name of the robot."""

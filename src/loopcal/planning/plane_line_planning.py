@@ -388,9 +388,6 @@ class SurfacePlan(DrawnResult):
         u, k = self.poses.groups.shape
         return f"SurfacePlan({self.robot.name}: {u} groups of {k} points, rank {self.rank})"
 
-    def __str__(self) -> str:
-        return "\n".join(str(finding) for finding in self.findings)
-
     def list_poses(self) -> list[dict[str, Any]]:
         """Return for each point its name, group, role, held coordinates, command and readings."""
         k, roles = self.poses.groups.shape[1], self.list_roles()

@@ -236,9 +236,6 @@ class Plan(DrawnResult):
             f"efficiency at least {round_to_digits(self.quality.efficiency)})"
         )
 
-    def __str__(self) -> str:
-        return "\n".join(str(finding) for finding in self.findings)
-
     def _report_errors(self, counted: str) -> Finding:
         """Return the expected errors: before, with random poses, and after."""
         given, target = self.errors, self.options.target

@@ -45,11 +45,17 @@ class Result:
         return [str(self)]
 
     def __str__(self) -> str:
-        """Return the registered page as text, without one the representation."""
+        """Return the registered page as text, without one the findings, one on each line.
+
+        A result without a page and without findings is its representation.
+        """
         from loopcal.results.tables import render_text
 
         own_page = find_presenter("page", type(self))
-        return repr(self) if own_page is None else render_text(own_page(self), UNBROKEN)
+        if own_page is not None:
+            return render_text(own_page(self), UNBROKEN)
+        stated = getattr(self, "findings", ()) or (getattr(self, "finding", None) or repr(self),)
+        return "\n".join(map(str, stated))
 
     def __repr__(self) -> str:  # of dataclasses with `repr=False`, which have a text or a page
         return str(self)

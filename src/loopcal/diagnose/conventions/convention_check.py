@@ -111,9 +111,6 @@ class ConventionCheck(Result):
         code = "agrees" if self.finding is None else self.finding.code
         return f"<ConventionCheck: {code}, misfit {round_to_digits(self.misfit)}>"
 
-    def __str__(self) -> str:
-        return repr(self) if self.finding is None else str(self.finding)
-
 
 def check_conventions(
     robot: Mechanism,
