@@ -7,6 +7,7 @@ its changes before you commit them.
 
 import re
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 
 from loopcal.findings import Severity, catalog
@@ -37,10 +38,11 @@ and data. The text is for people and may change. In Python, results hold `findin
 is the text, and an error has the `code` of its finding. In JSON, the keys are `code`, `severity`,
 `data` and `text`.
 
-The table has the first sentence of each message. The message itself continues with numbers, the
-reason or the next step. Words in *italics* stand for data, and sentences in quotation marks are
-examples. A sentence that begins with a small letter is a part of another message. A second line
-adds what the message leaves out: its condition, and what to do.
+Most messages say what happened and what to do, so this page only lists their codes by severity
+([all texts](../tests/findings/wording.txt)). The tables have the others: the first sentence, then
+what the message leaves out, its condition and what to do. Words in *italics* stand for data, and
+sentences in quotation marks are examples. A sentence that begins with a small letter is a part of
+another message.
 """
 
 
@@ -57,21 +59,29 @@ def describe_circumstances(entry: Entry) -> str:
     return f"{entry.when} {fill_template(entry.action, **entry.example)}".strip()
 
 
+def list_codes(entries: Iterable[Entry]) -> str:
+    """Return the codes of entries by severity, the least severe first."""
+    lines = []
+    for severity in SEVERITIES:
+        codes = [f"`{e.code}`" for e in entries if e.severity is severity]
+        lines += [f"- {severity.value}: {', '.join(codes)}\n"] * bool(codes)
+    return "".join(lines)
+
+
 def write_page() -> str:
     """Return docs/findings.md."""
     severities = [(f"`{severity.value}`", words) for severity, words in SEVERITIES.items()]
     sections = [HEAD, format_table(("severity", "meaning"), severities)]
     for file in catalog.FILES:
+        entries = [(e, describe_circumstances(e)) for e in catalog.read_entries(file).values()]
         rows = [
-            (
-                f"`{e.code}`",
-                e.severity.value,
-                "<br>".join(filter(None, (describe_text(e), describe_circumstances(e)))),
-            )
-            for e in catalog.read_entries(file).values()
+            (f"`{e.code}`", e.severity.value, f"{describe_text(e)}<br>{circumstances}")
+            for e, circumstances in entries
+            if circumstances
         ]
         sections.append(f"## {catalog.read_document(file)['title']}\n")
-        sections.append(format_table(("code", "severity", "text"), rows))
+        sections += [format_table(("code", "severity", "text"), rows)] * bool(rows)
+        sections.append(list_codes([e for e, circumstances in entries if not circumstances]))
     return "\n".join(sections)
 
 

@@ -126,7 +126,7 @@ def test_rotation_of_the_platform_frame_is_left_out_and_reported(fit_5):
     assert np.isfinite(result.sd).all()
     assert result.reference.code == "accuracy.frame"
     assert result.reference.data["fitted"] == ("platform",)
-    assert "best rigid fit of the platform frame, which the measurements do not" in result.frame
+    assert "best rigid fit of the platform frame over the measured poses, because" in result.frame
 
 
 def make_base_unobservable(fit, extra=None):

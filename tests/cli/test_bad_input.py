@@ -152,7 +152,7 @@ DATA_CASES = [
     ("b,1,", "b,", "data.csv:6: this row has 7 cells, but the header has 8 columns"),
     ("201.1", "NaN", "data.csv:6: column 'z' is 'NaN', which is not finite"),
     ("b,1,", "b,80,", "data.csv:6): q1 reads 80 mm, 5 mm outside its stroke of -75 to 75 mm"),
-    ("# noise: {z: 1 um}\n", "", "'z' has no noise"),
+    ("# noise: {z: 1 um}\n", "", "the noise of 'z' is missing"),
     ("1 um", "1", "'1' has no unit. Add one of m, mm"),
     ("201.1", "201,1", "data.csv:6: this row has 9 cells"),
     ("# noise", "# controller: no.yaml\n# noise", "data.csv:3: 'controller' needs commanded"),

@@ -110,7 +110,7 @@ def test_a_wrong_row_that_is_pasted_twice_confirms_nothing(measure, rows) -> Non
 
 @pytest.mark.slow
 def test_a_row_is_taken_back_used_and_left_out(measure, rows) -> None:
-    measure([*map(join, rows[:3]), "back"], f"the row of pose {rows[2][0]} is taken back")
+    measure([*map(join, rows[:3]), "back"], f"loopcal removes the row of pose {rows[2][0]}")
     assert read_used() == [row[0] for row in rows[:2]]
     measure(["out"], "resumed with 2 rows, 2 of them in use")
     assert read_used() == [rows[0][0]]

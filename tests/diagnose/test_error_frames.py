@@ -204,7 +204,7 @@ def test_figures_of_three_targets_in_an_unknown_frame_have_the_size_of_the_true_
     assert after is not None
     assert 0.4 * true_error < random.position < 1.6 * true_error
     assert after.position < random.position
-    assert "which the measurements do not determine, over the workspace" in str(planned)
+    assert "over the workspace, because the measurements do not determine" in str(planned)
 
 
 def test_known_datum_is_called_absolute_and_fits_nothing():

@@ -202,7 +202,7 @@ def test_commanded_coordinates_are_converted_by_the_controller(tmp_path, robot) 
         ("1 um", "1 urad", 3, "'noise.z': 'urad' is a unit of angle"),
         ("1 um", "-1 um", 3, "the noise of 'z' is -1 um"),
         ("z: 1 um", "zz: 1 um", 3, "unknown key 'zz' in 'noise'"),
-        ("# noise: {z: 1 um}\n", "", None, "'z' has no noise"),
+        ("# noise: {z: 1 um}\n", "", None, "the noise of 'z' is missing"),
         ("# kind", "# format: 9\n# kind", 1, "has format 9"),
         ("z [mm]", "z", 4, "column 'z' has no unit"),
         ("z [mm]", "zz [mm]", 4, "column 'zz' is unknown .did you mean 'z'"),
