@@ -107,8 +107,8 @@ def test_identifiers_are_unique_and_references_lead_somewhere(page) -> None:
 def test_pictures_have_descriptions_and_tables_have_scopes(page) -> None:
     text = page.read_text("utf-8")
     pictures = re.findall(r"<figure[^>]*>\s*(?:<script.*?</script>\s*)?(<svg.*?</svg>)", text, re.S)
-    names = ("validation", "scene", "accuracy", "budget", "parameter", "correlation", "residual")
-    for name, picture in zip(names, pictures, strict=True):
+    names = ("validation", "scene", "accuracy", "budget", "volume", "parameter", "correlation")
+    for name, picture in zip((*names, "residual"), pictures, strict=True):
         assert f'role="img" aria-labelledby="{name}-figure-description"' in picture
         assert "<text" in picture  # text, not outlines
         described = re.search(f'id="{name}-figure-description">([^<]+)</span>', text)
@@ -239,6 +239,8 @@ def test_a_volume_that_is_asked_for_later_is_in_report_and_certificate(
     assert bound[4] == "does not conform"
     assert [row["text"].count("does not conform") for row in first[2]["list"]] == [1]
     assert "Working volume: box y -30 mm to 30 mm" in first[3]["sentence"]
+    place = f"largest at y {1e3 * wanted.worst['y']:g} mm"
+    assert page.read_text("utf-8").count(place) == 2  # the sentence, and the picture's caption
     capsys.readouterr()
     assert main(["certificate", str(run.path), facts, *volume]) == 2
     text = capsys.readouterr().out

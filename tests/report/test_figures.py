@@ -28,6 +28,7 @@ from loopcal.report.figures.result_figures import draw_accuracy_map, draw_plan, 
 from loopcal.report.figures.style import label_poses, shorten, start_figure
 from loopcal.report.pictures import render_figure
 from loopcal.report.scene.scene import draw_robot
+from loopcal.units import find_unit
 
 OF_FITS = [draw_residuals, draw_parameters, draw_correlation, draw_convergence]
 WITHOUT_UNIT = {"", "pose"}
@@ -230,6 +231,44 @@ def test_accuracy_map_shows_every_pose_once_in_slices(name, request) -> None:
     values = np.concatenate([points.get_array() for points in first])
     assert_allclose(np.sort(values), np.sort(1e3 * accuracy.uncertainty.position[bounded]))
     assert accuracy.uncertainty.frame in figure.get_suptitle()
+    check(figure)
+
+
+SOLIDS = {  # volume -> whether it has a surface, whether the robot reaches all of it
+    "cylinder": (lc.Volume({"z": (0.06, 0.12)}, radius=0.05), True, True),
+    "beyond reach": (
+        lc.Volume({"x": (-0.05, 0.3), "y": (-0.05, 0.05), "z": (0.06, 0.12)}),
+        True,
+        False,
+    ),
+    "plane": (lc.Volume(radius=0.05), True, True),
+    "line": (lc.Volume({"x": (-0.05, 0.05)}), False, True),
+    "list": (
+        lc.Volume(points=[[0.0, 0.0, 0.1], [0.01, 0.0, 0.1], [0.01, 0.03, 0.11]]),
+        False,
+        True,
+    ),
+}
+
+
+@pytest.mark.parametrize("name", SOLIDS)
+def test_volume_shows_its_errors_and_the_place_of_the_largest(name, linear_delta) -> None:
+    volume, has_surface, is_whole = SOLIDS[name]
+    accuracy = lc.bound_errors(linear_delta.fit, volume)
+    figure = accuracy.plot()
+    drawn, disk = figure.axes[0].collections
+    place = np.array([*accuracy.worst.values()])[: len(accuracy.spacing) or 3]
+    assert_allclose(np.ravel(disk._offsets3d)[: len(place)], 1e3 * place, atol=1e-9)
+    unit = find_unit(figure.axes[-1].get_ylabel().partition("[")[2][:-1])
+    assert_allclose(np.asarray(disk.get_array()) * unit.factor_to_si, accuracy.pointwise)
+    shown = drawn.get_array()
+    assert drawn.get_clim() == disk.get_clim()
+    assert disk.get_array() >= shown.max() >= shown.min() >= drawn.get_clim()[0]
+    if has_surface:
+        corners = np.concatenate(drawn._faces)
+        assert np.ptp(corners, axis=0).max() == pytest.approx(100.0) or not is_whole  # [mm]
+        assert np.ptp(corners[:, 0]) < 300.0  # without what is beyond reach
+    assert (accuracy.reachable == 1.0) == is_whole
     check(figure)
 
 

@@ -17,7 +17,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -46,10 +46,14 @@ from loopcal.mechanism.platform_coordinates import POSITION, get_dimension, read
 from loopcal.mechanism.solutions import Solution, forward, inverse
 from loopcal.mechanism.workspace import find_reachable
 from loopcal.results.description import Field, fields
+from loopcal.results.presenters import draw
 from loopcal.results.result import Result
 from loopcal.results.tables import choose_unit, to_quantity
-from loopcal.typing import FloatArray
+from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import Dimension, parse_quantity
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 LENGTH = Dimension.LENGTH
 CONDITIONS = "accuracy.volume-conditions"  # code of what reports add to the bound
@@ -159,7 +163,7 @@ class Volume:
             reason = reasons.most_common(1)[0][0]
             if reached.any():
                 spacing = {n: (high - low) / (count - 1) for n, (low, high) in spans.items()}
-                yield Grid(points[reached], float(reached.mean()), reason, spacing)
+                yield Grid(points[reached], reached, reason, spacing)
                 reason = ""
         if reason:
             raise EstimationError(
@@ -185,7 +189,7 @@ class Grid(NamedTuple):
     """The points of a volume that a robot reaches."""
 
     points: FloatArray  # (n, c) controlled coordinates [m, rad]
-    reachable: float  # share of all points
+    reached: BoolArray  # (m,) of all points
     reason: str  # why the robot does not reach most of the others
     spacing: Mapping[str, float]  # of neighbors, by coordinate [m, rad]
 
@@ -260,6 +264,8 @@ class VolumeAccuracy(Result):
     reference : point and frame to which the errors refer.
     conformity : of the largest error with a limit, if one is stated.
     findings : the statement in words, what restricts it, and the decision on the limit.
+    robot : the machine. bounds : (m,) of the error at each single point of the grid, NaN out of
+        reach [m].
     """
 
     volume: Volume
@@ -274,6 +280,8 @@ class VolumeAccuracy(Result):
     reference: Finding
     conformity: Conformity | None
     findings: tuple[Finding, ...]
+    robot: Mechanism
+    bounds: FloatArray
 
     FIELDS: ClassVar[tuple[Field, ...]] = (
         *fields("simultaneous", "pointwise", "worst", "points", "reachable", "spacing"),
@@ -282,6 +290,10 @@ class VolumeAccuracy(Result):
         *fields(words=lambda stated: word_phrase("volume", stated.findings[0].data)),
         Field("conformity", is_optional=True),
     )
+
+    def plot(self) -> Figure:
+        """Draw the volume in the colors of the error at each of its points."""
+        return draw(self)
 
 
 def bound_errors(
@@ -341,8 +353,10 @@ def bound_errors(
         **reference.data,
     }
     findings = [report_finding(of, points=n, **words) for of in ("accuracy.volume", CONDITIONS)]
-    if grid.reachable < 1.0:
-        reach = {"reachable": grid.reachable, "reason": grid.reason}
+    reachable, bounds = float(grid.reached.mean()), np.full(len(grid.reached), math.nan)
+    bounds[grid.reached] = drawn.pointwise
+    if reachable < 1.0:
+        reach = {"reachable": reachable, "reason": grid.reason}
         findings.append(report_finding("accuracy.volume-reach", points=n, **reach))
     if outside:
         findings.append(report_finding("accuracy.volume-extrapolated", share=outside))
@@ -350,8 +364,8 @@ def bound_errors(
     if judged is not None:
         findings.append(report_decision("position", judged, robot.get_unit(LENGTH)))
     return VolumeAccuracy(
-        *(volume, simultaneous, pointwise, worst, n, grid.reachable, grid.spacing, refinement),
-        *(outside, reference, judged, tuple(findings)),
+        *(volume, simultaneous, pointwise, worst, n, reachable, grid.spacing, refinement),
+        *(outside, reference, judged, tuple(findings), robot, bounds),
     )
 
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from loopcal.apply.accuracy import AccuracyMap, accuracy_map
+from loopcal.apply.volume_accuracy import Volume, bound_errors
 from loopcal.errors import LoopcalError
 from loopcal.estimate.result import KindResiduals
 from loopcal.measure.kinds.joints import ActuatorReadings
@@ -153,6 +154,16 @@ def draw_budget_picture(record: CalibrationRecord) -> Iterator[Element]:
     budget = record.result.get("expected_error")
     if budget and budget["sources"]:
         yield show_figure(result_figures.draw_budget_sources(budget), "budget-figure")
+
+
+@report_figure("budget")
+def draw_volume_picture(record: CalibrationRecord) -> Iterator[Element]:
+    """Yield the stated volume in the colors of the error at each of its points."""
+    if stated := record.result.get("volume"):
+        volume, frame = Volume(**stated["volume"]), record.result["options"]["frame"]
+        accuracy = bound_errors(record.posterior, volume, frame)
+        data = accuracy.findings[0].data
+        yield show_figure(result_figures.draw_volume(accuracy), "volume-figure", **data)
 
 
 @report_figure("workspace")

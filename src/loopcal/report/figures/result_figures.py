@@ -18,8 +18,9 @@ from loopcal.apply.height_errors import HeightErrors
 from loopcal.apply.repeatability import DIMENSIONS, Estimate, Repeatability, VisitedPose
 from loopcal.apply.run_comparison import RunComparison
 from loopcal.apply.validation import Validation
+from loopcal.apply.volume_accuracy import VolumeAccuracy
 from loopcal.diagnose.fit_examination import ROUNDING
-from loopcal.findings.wording import count_decimals, name_count
+from loopcal.findings.wording import FINE, count_decimals, name_count
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import (
     POSITION,
@@ -38,6 +39,7 @@ from loopcal.report.figures.style import (
     DASHED,
     DIVERGING,
     DOT,
+    LABEL,
     LINE,
     MARKERS,
     PALE,
@@ -273,6 +275,121 @@ def _draw_line(
 def _unit_of(name: str) -> Unit:
     """Return the unit in which a controlled coordinate is drawn."""
     return DISPLAY_UNITS[get_dimension(name)]
+
+
+# The largest error in a volume: a solid in the colors of the bound at each of its points.
+
+CELLS = 12  # along each axis of a solid; between compared points its colors are interpolated
+UP, ASIDE = 24.0, 25.0  # angles of a view from the direction of the largest bound [deg]
+
+
+@register("figure", VolumeAccuracy)
+def draw_volume(accuracy: VolumeAccuracy) -> Figure:
+    """Draw a volume in the colors of the bound of the error at each single point.
+
+    A solid is seen from the side of the largest bound, which a disk marks, and from the other side,
+    a plane from above. Its axes are up to three coordinates, positions before angles; of the others
+    the largest bound counts. Cells with a corner out of reach are left out. A list is points.
+    """
+    from mpl_toolkits.mplot3d.art3d import Poly3DCollection
+
+    robot, is_grid = accuracy.robot, bool(accuracy.spacing)
+    names = [name for name in robot.controlled if name in (accuracy.spacing or accuracy.worst)]
+    names = ([name for name in names if name in POSITION] or names)[:3]
+    units, count = [_unit_of(name) for name in names], len(names)
+    unit = choose_unit(robot.get_unit(Dimension.LENGTH), [accuracy.pointwise], FINE)
+    points, values = _list_solid(accuracy, names)
+    points[..., :count] /= [of_name.factor_to_si for of_name in units]
+    values, flat = values / unit.factor_to_si, points.reshape(-1, 3)
+    worst, extent = flat[np.nanargmax(values)], np.ptp(flat, axis=0)
+    thin = extent.max() * np.array([0.3, 0.3, 1e-3])  # axes that the volume does not have
+    x, y, _ = worst - (flat.min(axis=0) + extent / 2.0)
+    side = np.degrees(np.arctan2(y, x)) + ASIDE
+    views = [(UP, side), (UP, side + 180.0)] if count > 2 else [(90.0, -90.0)]
+    figure, panels = start_panels(
+        1.0 + 4.3 * len(views), 3.2, 1, len(views),
+        subplot_kw={"projection": "3d", "proj_type": "ortho", "computed_zorder": False},
+    )  # fmt: skip
+    colors: dict[str, Any] = {"cmap": SEQUENTIAL, "clim": (np.nanmin(values), np.nanmax(values))}
+    words = ("from the side of the largest error (disk)", "from the opposite side")
+    for axes, view, title in zip(panels[0], views, words, strict=False):
+        axes.view_init(*view)
+        axes.set_title(title if count > 2 else "disk: the largest error", fontsize=LABEL)
+        if is_grid and count > 1:
+            faces, of_faces = _list_faces(points, values, *np.radians(view))
+            surface = Poly3DCollection(faces, array=of_faces, lw=0.4, **colors)
+            axes.add_collection3d(surface)
+            surface.set_edgecolor("face")
+        else:
+            axes.scatter(*flat.T, c=values.ravel(), depthshade=False, **colors)
+        all_axes = (axes.xaxis, axes.yaxis, axes.zaxis)
+        for name, of_name, axis in zip(names, units, all_axes, strict=False):
+            axis.set_label_text(f"{name} [{of_name.symbol}]", fontsize=LABEL)
+        axes.set_box_aspect(np.where(extent > 0.0, extent, thin), zoom=1.1 if count > 2 else 0.85)
+        axes.tick_params(labelsize=SMALL)
+        axes.locator_params(nbins=4)
+        for axis in all_axes[count:]:
+            axis.set_ticks([])
+    largest = {"c": [np.nanmax(values)], "s": AREA, "ec": "black", "lw": 2.0, "zorder": 9}
+    drawn = panels[0, 0].scatter(*worst[:, None], depthshade=False, **largest, **colors)
+    label = f"position error, 95 % at each point [{unit.symbol}]"
+    add_colorbar(figure, drawn, [*panels[0]], label, pad=0.1)
+    n = name_count(accuracy.points, "compared point")
+    return finish_figure(figure, f"{robot.name}: position error in the volume, {n}")
+
+
+def _list_solid(accuracy: VolumeAccuracy, names: Sequence[str]) -> tuple[FloatArray, FloatArray]:
+    """Return points (a, b, c, 3) and largest bounds (a, b, c) over the coordinates of these names;
+    (n, 1, 1) of a list.
+    """
+    from scipy.ndimage import zoom
+
+    robot, volume, values = accuracy.robot, accuracy.volume, accuracy.bounds
+    spans, places = volume.list_spans(robot), volume.list_points(robot, 2)
+    if spans:
+        low, high = spans[names[0]]
+        cells = round((high - low) / accuracy.spacing[names[0]])
+        finer = 1 + cells * (max(1, CELLS // cells) if len(spans) <= len(names) else 1)
+        sizes = {name: len(of) for name, of in volume.list_values(robot).items()}
+        values = values.reshape([*(sizes | dict.fromkeys(spans, cells + 1)).values()])
+        others = tuple(i for i, name in enumerate(sizes) if name not in names)
+        largest = np.fmax.reduce(values, axis=others)
+        values = np.asarray(zoom(largest, finer / (cells + 1), order=1))
+        places = volume.list_points(robot, finer)
+        places = places.reshape([*(sizes | dict.fromkeys(spans, finer)).values(), -1])
+        places = places[tuple(slice(None) if name in names else 0 for name in sizes)]
+    values = values.reshape(*values.shape, *[1] * (3 - values.ndim))
+    points = np.zeros((*values.shape, 3))
+    columns = [robot.controlled.index(name) for name in names]
+    points[..., : len(names)] = places[..., columns].reshape(*values.shape, -1)
+    return points, values
+
+
+def _list_faces(
+    points: FloatArray, values: FloatArray, elevation: float, azimuth: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return corners (f, 4, 3) and mean values of the faces of a solid that are turned to a view;
+    of a plane both sides. A cell of the grid whose corners are not all known is not in the solid.
+    """
+    if values.shape[2] == 1:
+        points, values = np.repeat(points, 2, axis=2), np.repeat(values, 2, axis=2)
+    to_eye = [np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation)]
+    inside, faces, of_faces = np.isfinite(values), [], []
+    for axis in range(3):
+        inside = np.delete(inside, 0, axis) & np.delete(inside, -1, axis)
+    for axis in range(3):
+        ends = np.eye(3, dtype=int)[axis]
+        step = np.pad(inside.astype(int), np.stack([ends, ends], axis=1))
+        change = np.diff(step, axis=axis)  # +1 where the solid begins
+        u, v = np.roll(np.eye(3, dtype=int), -axis, axis=0)[1:]
+        corners = np.argwhere(change)[:, None] + [0 * u, u, u + v, v]
+        at = tuple(np.moveaxis(corners, 2, 0))
+        outward = np.cross(points[at][:, 3] - points[at][:, 1], points[at][:, 2] - points[at][:, 0])
+        outward *= change[change != 0][:, None]
+        seen = outward @ [*to_eye, np.sin(elevation)] >= 0.0
+        faces.append(points[at][seen])
+        of_faces.append(values[at].mean(axis=1)[seen])
+    return np.concatenate(faces), np.concatenate(of_faces)
 
 
 # Errors on measured poses before and after calibration, beside the noise floor and the limits.
