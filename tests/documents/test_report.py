@@ -23,6 +23,7 @@ from loopcal.report.document import figures
 from loopcal.report.document.elements import Document, Picture, render_html
 from loopcal.report.document.figures import thin_rows
 from loopcal.report.document.sections import build_calibration_document, build_sections
+from loopcal.report.pictures import inline_figure
 from loopcal.report.scene.scene import load_script
 from loopcal.report.validation_view import view_errors
 from loopcal.report.words import say
@@ -372,7 +373,8 @@ def test_a_decorated_function_adds_a_figure_to_its_section(run, monkeypatch) -> 
     def draw_count(record):
         figure = Figure()
         figure.suptitle(f"{len(record.fitted_labels)} poses")
-        yield figures.make_picture(figure, "count-figure", "Number of poses.", "It is a number.")
+        svg = inline_figure(figure, "count-figure")
+        yield Picture("count-figure", svg, "Number of poses.", "It is a number.")
 
     (section,) = build(load_record(run), "poses").sections
     *_, picture = section.elements

@@ -63,16 +63,12 @@ def draw_figures(section: str, record: CalibrationRecord) -> Iterator[Element]:
             yield from draw(record)
 
 
-def show_figure(figure: Figure, name: str, scene: str = "", **data: Any) -> Picture:
-    """Return a figure as a picture with the words of this name, filled with data."""
-    caption, description = (say(f"{name}.{key}", **data) for key in ("caption", "description"))
-    return make_picture(figure, name, caption, description, scene)
-
-
-def make_picture(
-    figure: Figure, name: str, caption: str, description: str, scene: str = ""
+def show_figure(
+    figure: Figure, name: str, scene: str = "", words: str = "", **data: Any
 ) -> Picture:
-    """Return a figure as a picture; see `Picture` for the arguments."""
+    """Return a figure as a picture with the words of this or another name, filled with data."""
+    words = words or name
+    caption, description = (say(f"{words}.{key}", **data) for key in ("caption", "description"))
     return Picture(name, inline_figure(figure, name), caption, description, scene)
 
 
@@ -128,24 +124,22 @@ def thin_rows(rows: KindResiduals, count: int) -> KindResiduals:
 def draw_validation_picture(record: CalibrationRecord) -> Iterator[Element]:
     """Yield the errors at held-out poses before and after; of many rows none."""
     errors = record.validation
-    if errors is None or not errors.quantities:
-        return
-    if len(errors.poses) > MOST_ROWS:
-        yield say("validation-figure.many", count=len(errors.poses))
-    else:
-        yield show_figure(result_figures.draw_validation(errors), "validation-figure")
+    if errors is not None and errors.quantities:
+        yield _show_poses(errors, result_figures.draw_validation, "validation-figure")
 
 
 @report_figure("heights")
 def draw_height_picture(record: CalibrationRecord) -> Iterator[Element]:
     """Yield the errors of heights over x and y before and after; of many heights none."""
-    heights = record.heights
-    if heights is None:
-        return
-    if len(heights.poses) > MOST_ROWS:
-        yield say("height-figure.many", count=len(heights.poses))
-    else:
-        yield show_figure(result_figures.draw_height_errors(heights), "height-figure")
+    if record.heights is not None:
+        yield _show_poses(record.heights, result_figures.draw_height_errors, "height-figure")
+
+
+def _show_poses(result: Any, draw: Callable[[Any], Figure], name: str) -> Element:
+    """Return the figure of a result at poses; of many poses a sentence."""
+    if (count := len(result.poses)) > MOST_ROWS:
+        return say(f"{name}.many", count=count)
+    return show_figure(draw(result), name)
 
 
 @report_figure("budget")

@@ -567,10 +567,6 @@ def build_calibration_view(record: CalibrationRecord) -> Document:
 def _draw_home(robot: Mechanism) -> Picture:
     """Return a robot at home."""
     scene = Scene(robot)
-    return figures.make_picture(
-        draw_scene(scene),
-        "scene-figure",
-        say("home-figure.caption"),
-        say("home-figure.description"),
-        format_scene(scene),
+    return figures.show_figure(
+        draw_scene(scene), "scene-figure", format_scene(scene), words="home-figure"
     )

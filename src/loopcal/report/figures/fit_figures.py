@@ -24,7 +24,7 @@ from loopcal.report.figures.style import (
     DIVERGING,
     DOT,
     FEW_TICKS,
-    GRID,
+    LABEL,
     LINE,
     MARKERS,
     PALE,
@@ -476,15 +476,12 @@ def draw_identifiability(analysis: Identifiability) -> Figure:
     combinations = (*analysis.unidentifiable, *analysis.weak)[:MOST_COMBINATIONS]
     names = list(dict.fromkeys(name for c in combinations for name in c.names))
     height = max(4.7, 2.2 + 0.17 * len(names[:MOST_PARAMETERS]))
-    if not combinations:
-        figure = start_figure(5.2, height)
-        _draw_spectrum(figure.add_subplot(), analysis)
-    else:
-        width = 5.2 + (2.2 + 0.42 * len(combinations) + 0.8)
-        ratios = [5.0, width - 5.0]
-        figure, ((spectrum, weights),) = start_panels(width, height, 1, 2, width_ratios=ratios)
-        _draw_spectrum(spectrum, analysis)
-        _draw_combinations(figure, weights, analysis, combinations, names)
+    widths = [5.0, 3.2 + 0.42 * len(combinations)] if combinations else [5.2]
+    how = {"width_ratios": widths}
+    figure, (panels,) = start_panels(sum(widths), height, 1, len(widths), **how)
+    _draw_spectrum(panels[0], analysis)
+    if combinations:
+        _draw_combinations(figure, panels[1], analysis, combinations, names)
     add_legend(figure, figure.axes[0].get_legend_handles_labels()[0])
     robot = analysis.free_parameters.robot.name
     rank = f"rank {analysis.rank} of {analysis.n_parameters}"
@@ -584,17 +581,10 @@ def draw_regularization(curves: RegularizationCurves) -> Figure:
             axes.plot(*place, marker, color=color, ms=7.0, mfc="none", label=label)
         axes.axhline(1.0, color="0.5", lw=0.8, ls="--", label="noise alone")
         method, number = WORDS[curve.name]
-        axes.set_title(method, fontsize=10)
         lam = "lam [(sigma per prior sd)²]"
-        axes.set_xlabel(lam if curve.name == "lam" else f"directions {number} [1]")
-        axes.grid(visible=True, lw=GRID)
+        label_axes(axes, lam if curve.name == "lam" else f"directions {number} [1]", "", method)
         axes.legend(frameon=False, fontsize=SMALL)
-    panels[0].set_xscale("log")
-    ticks = np.unique(np.round(np.log10(curves.ridge.values[[0, -1]])))
-    step = max(int(np.ceil((ticks[-1] - ticks[0]) / 7.0)), 1)
-    powers = np.arange(np.ceil(ticks[0]), ticks[-1] + 1, step)
-    panels[0].set_xticks(10.0**powers, [f"1e{int(power)}" for power in powers])
-    panels[0].minorticks_off()
-    panels[0].set_ylabel("held-out mean square over noise [1]")
+    panels[0].set_ylabel("held-out mean square over noise [1]", fontsize=LABEL)
+    scale_logarithmically(panels[0].xaxis, (), decades=8)
     scale_logarithmically(panels[0].yaxis)
     return finish_figure(figure, f"{curves.robot}: n = {curves.poses} poses")

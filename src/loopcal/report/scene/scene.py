@@ -549,9 +549,9 @@ VIEWS = {(0, 1): "from above", (0, 2): "from the side", (1, 2): "from the front"
 def draw_robot(robot: Mechanism) -> Figure:
     """Draw a robot at home, in the length unit of its file."""
     length, limbs = find_unit(robot.units[Dimension.LENGTH]), robot.assembly.limbs
+    parts = list_parts(robot, robot.home_state)
     strokes = [  # lines or points (n, 3), and the arguments of matplotlib's `plot`
-        (part.points[0] / length.factor_to_si, _choose_style(part))
-        for part in list_parts(robot, robot.home_state)
+        (part.points[0] / length.factor_to_si, _choose_style(part)) for part in parts
     ]
     everything = np.concatenate([points for points, _ in strokes])
     low, high = everything.min(axis=0), everything.max(axis=0)
@@ -559,10 +559,10 @@ def draw_robot(robot: Mechanism) -> Figure:
     figure = start_figure(7.0 if is_flat else 11.8, 6.4 if is_flat else 6.0)
     space: Any = None if is_flat else figure.add_subplot(1, 2, 1, projection="3d")
     above: Any = figure.add_subplot() if is_flat else figure.add_subplot(1, 2, 2)
-    for points, style in strokes:
-        above.plot(*points.T[shown], **style)
-        if space is not None:
-            space.plot(*points.T, **style)
+    panels = [(above, shown)] + ([] if space is None else [(space, [0, 1, 2])])
+    for axes, kept in panels:
+        for points, style in strokes:
+            axes.plot(*points.T[kept], **style)
     middle = np.mean([points[0] for points, _ in strokes[: len(limbs)]], axis=0)
     for (points, style), limb in zip(strokes, limbs, strict=False):  # first the lines of limbs
         _name_limb(above, points[:, shown], limb.name, middle[shown], style["color"])
@@ -570,7 +570,7 @@ def draw_robot(robot: Mechanism) -> Figure:
             name, place = f"  {limb.name}", points[0]
             space.text(*place, name, fontsize=SMALL, color=style["color"], zorder=9)
     _finish(space, above, low, high, length.symbol, shown)
-    add_legend(figure, _list_handles(robot))
+    add_legend(figure, _list_handles(parts, "xy" if is_flat else "xyz"))
     counts = {
         "limb": len(limbs),
         "joint": sum(len(limb.joints) for limb in limbs),
@@ -659,21 +659,17 @@ def _finish(
     space.set_title("perspective", fontsize=LABEL)
 
 
-def _list_handles(robot: Mechanism) -> list[Any]:
-    """Return a handle for everything that the picture of a robot contains."""
-    limbs = robot.assembly.limbs
-    kinds = {joint.kind for limb in limbs for joint in limb.joints}
-    driven = {joint.kind for limb in limbs for joint in limb.joints if joint.actuator}
-    marker = "s" if "P" in driven else "o" if driven else "D"
-    has_rods = any(limb.ending == "distance" for limb in limbs)
-    has_rods = has_rods or any(actuator.is_triangle for actuator in robot.actuators)
-    has_axes = "R" in kinds and not is_planar(robot)
+def _list_handles(parts: tuple[Part, ...], names: str) -> list[Any]:
+    """Return a handle for everything that a picture contains; `names` of the axes of frames."""
+    roles, driven = {part.role for part in parts}, {part.role for part in parts if part.is_driven}
+    marker = "s" if "slide" in driven else "o" if "joint" in driven else "D"
     guide = {"color": "0.4", "lw": 1.0, "ls": (0, (4, 3))}
-    axes = zip("xy" if is_planar(robot) else "xyz", FRAME_COLORS, strict=False)
+    axes = zip(names, FRAME_COLORS, strict=False)
+    has_axes = "axis" in roles and names == "xyz"
     rows: list[tuple[str, bool, dict[str, Any]]] = [
         ("axis of a revolute joint", has_axes, {"color": "black", "lw": 1.2}),
-        ("guide of a sliding joint", "P" in kinds, guide),
-        ("rod", has_rods, {"color": "0.4", "lw": 1.6}),
+        ("guide of a sliding joint", "guide" in roles, guide),
+        ("rod", not roles.isdisjoint(("rod", "cable")), {"color": "0.4", "lw": 1.6}),
         ("driven, filled", True, _dot(marker, "0.4", "0.4")),
         ("platform", True, {"color": "0.25", "lw": 2.0}),
         ("tool", True, _dot("*", "black", "black", 8.0)),
