@@ -131,11 +131,8 @@ class QuantityErrors:
     @property
     def balance(self) -> FloatArray:
         """(e,) largest minus smallest measured component; NaN with fewer than two."""
-        present = np.isfinite(self.components)
-        high = np.where(present, self.components, -np.inf).max(axis=1, initial=-np.inf)
-        low = np.where(present, self.components, np.inf).min(axis=1, initial=np.inf)
-        enough = present.sum(axis=1) > 1
-        return np.where(enough, np.where(enough, high, 0.0) - np.where(enough, low, 0.0), np.nan)
+        span = np.fmax.reduce(self.components, axis=1) - np.fmin.reduce(self.components, axis=1)
+        return np.where(np.isfinite(self.components).sum(axis=1) > 1, span, np.nan)
 
     @property
     def statistics(self) -> Statistics:
@@ -303,17 +300,13 @@ def compute_row_errors(
             components = np.full((len(o), MOST_COMPONENTS), np.nan)
             components[:, : len(group.columns)] = shown[:, list(group.columns)]
             measured = np.isfinite(components).any(axis=1)
-            names = tuple(
-                name
-                for name, i in zip(group.components, group.columns, strict=True)
-                if o.present[:, i].any()
-            )
+            columns = zip(group.components, components.T, strict=False)
             errors = QuantityErrors(
                 group.dimension,
                 components[measured],
                 first_row + np.flatnonzero(measured),
                 (group.target,) * int(measured.sum()),
-                names,
+                tuple(name for name, values in columns if np.isfinite(values).any()),
             )
             errors_by_quantity.setdefault(group.quantity, []).append(errors)
         first_row += len(o)

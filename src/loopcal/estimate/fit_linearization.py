@@ -114,18 +114,12 @@ def linearize_fit(
     if linear is not None and fit.residual_test is linear.fit.residual_test:
         return linear._replace(fit=fit)
     data = prepare_fitted_data(fit, data)
-    problem, solution, linearization = linearize_at_estimate(fit, data)
-    method = fit.method
-    d = decompose_for(
-        method,
-        linearization.factor,
-        linearization.equations,
-        linearization.deviation,
-        fit.spectrum.tolerance,
-    )
+    problem, solution, rows = linearize_at_estimate(fit, data)
+    method, z, tolerance = fit.method, rows.deviation, fit.spectrum.tolerance
+    d = decompose_for(method, rows.factor, rows.equations, z, tolerance)
     penalty = np.array(method.penalty(d), dtype=np.float64)
     sources = find_variance_sources(d, penalty, fit.residual_test, method, fit.free_parameters)
-    return FitLinearization(fit, data, problem, solution, linearization, d, penalty, sources)
+    return FitLinearization(fit, data, problem, solution, rows, d, penalty, sources)
 
 
 def linearize_smooth_errors(

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import compress
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -63,7 +64,7 @@ class EstimatedPoses:
         """Return what is not known of the poses."""
         findings = []
         if self.is_undetermined.any():
-            names = _labels_of(self.labels, self.is_undetermined)
+            names = [*compress(self.labels, self.is_undetermined)]
             findings.append(report_finding("poses.undetermined", poses=names, n=len(names)))
         if not self.is_converged:
             findings.append(report_finding("poses.not-converged"))
@@ -79,7 +80,7 @@ class EstimatedPoses:
             "exact": int((sigma == 0.0).sum()),
             "uncertain": int(((sigma > 0.0) & np.isfinite(sigma)).sum()),
             "not_taken": int(np.isinf(sigma).sum()),
-            "open": _labels_of(self.labels, self.is_undetermined),
+            "open": [*compress(self.labels, self.is_undetermined)],
             "calm": self.is_converged,
         }
 
@@ -162,11 +163,6 @@ def _is_on_other_branch(robot: Mechanism, poses: EstimatedPoses, chosen: BoolArr
         gap = np.abs(np.where(turning, wrap_angle(gap), gap)) / size
         other[chosen] = home.closed[:, None] & (gap > SAME_READING)
     return other
-
-
-def _labels_of(labels: Sequence[str], chosen: BoolArray) -> list[str]:
-    """Return the labels of chosen poses."""
-    return [label for label, is_chosen in zip(labels, chosen, strict=True) if is_chosen]
 
 
 SAME_RATIO = 1e-9

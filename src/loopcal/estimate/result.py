@@ -25,6 +25,7 @@ import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import compress
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -248,11 +249,10 @@ def report_unknown_bias(
     """
     if prior is None or not np.isnan(prior).any():
         return []
-    lacking = method.lacks_tolerances(free)
     return [
         report_finding(
             "fit.ridge-without-intervals",
-            names=tuple(n for n, lacks in zip(free.names, lacking, strict=True) if lacks),
+            names=tuple(compress(free.names, method.lacks_tolerances(free))),
             is_correlated=free.correlation is not None,
         )
     ]
@@ -812,9 +812,7 @@ class NuisanceEstimate(TableResult):
 
     def report_unobservable(self) -> tuple[Finding, ...]:
         """Return which frames, targets, surfaces and offsets cannot be determined."""
-        owners = _owners(
-            n for n, lost in zip(self.names, self.is_unobservable, strict=True) if lost
-        )
+        owners = _owners(compress(self.names, self.is_unobservable))
         code = "setup.common-displacement" if self.is_harmless else "setup.unobservable"
         return (report_finding(code, names=owners),) if owners else ()
 
@@ -875,7 +873,7 @@ def estimate_nuisance(
     # three where it only translates, and the axis where it has one rotation
     count = int(is_free.sum() - done.rank[0])
     rotations = sum(freedom in ROTATION_AXES for freedom in robot.freedoms)
-    lost = [p for p, is_lost in zip(table.entries, is_unobservable, strict=True) if is_lost]
+    lost = [*compress(table.entries, is_unobservable)]
     square = np.zeros(U)
     square[is_free] = np.where(
         is_infinite | is_unobservable[is_free],
@@ -908,11 +906,10 @@ def add_followers(
         return combinations
     changed = np.abs(sparsify_basis(null) @ nuisance.slope.T)
     limit = SMALLEST_EFFECT * np.abs(nuisance.slope).max(axis=1, initial=0.0)
-    described = []
-    for combination, moved in zip(combinations, changed > limit, strict=True):
-        names = _owners(n for n, m in zip(nuisance.names, moved, strict=True) if m)
-        described.append(replace(combination, nuisance=tuple(names)))
-    return tuple(described)
+    return tuple(
+        replace(combination, nuisance=tuple(_owners(compress(nuisance.names, moved))))
+        for combination, moved in zip(combinations, changed > limit, strict=True)
+    )
 
 
 def _owners(names: Iterable[str]) -> list[str]:
