@@ -23,8 +23,10 @@ from loopcal.io.robot import robot_file as file_reference
 from loopcal.io.runs.run_folder import MADE_BY
 from loopcal.measure.kinds import KINDS
 from loopcal.measure.kinds.kind import Column, Kind
+from loopcal.mechanism.assembly import AXES
 from loopcal.mechanism.families import FAMILIES
 from loopcal.mechanism.families.limbs import Axis
+from loopcal.mechanism.families.placement import AngleTolerance, LengthTolerance, RatioTolerance
 from loopcal.mechanism.families.records import RobotRecord
 from loopcal.studies.files.study_file import LEVELS
 from loopcal.studies.specification import Question, Scores, StudySettings, list_columns
@@ -35,6 +37,15 @@ DOCS = Path(__file__).resolve().parent.parent / "docs"
 EXAMPLES = DOCS.parent / "examples" / "exports"
 PAGE, EXPORTS = DOCS / "files.md", DOCS / "exports.md"
 AXIS = file_reference.describe_type(Axis)
+SPREADS = (LengthTolerance, AngleTolerance, RatioTolerance)
+WORDS = {
+    AXIS: "axis",
+    " or ".join(f"`{name}`" for name in AXES): "displacement",
+    "[length, length, length]": "point",
+    "[0, 0, 0]": "0",
+    **{file_reference.name_record(record): "spread" for record in SPREADS},
+}
+"""What a key holds -> the word that the page explains once."""
 Keys = list[file_reference.Key]
 BLOCK = r"made by tools.file_reference: (?P<name>[\w-]+)"
 
@@ -73,7 +84,8 @@ def format_record(
     one with which it shares most keys.
     """
     excluded = set(without)
-    keys = [key for key in file_reference.list_keys(record) if key.name not in excluded]
+    listed = (key for key in file_reference.list_keys(record) if key.name not in excluded)
+    keys = [dataclasses.replace(key, holds=_hold(key), default="") for key in listed]
     sentence, own = refer_to_others(keys, shown or {})
     if shown is not None:
         shown[file_reference.name_record(record)] = keys
@@ -86,7 +98,7 @@ def refer_to_others(keys: Keys, shown: dict[str, Keys]) -> tuple[str, Keys]:
         common = set(keys) & set(shown[name])
         names = {key.name for key in keys}
         left_out = [f"`{key.name}`" for key in shown[name] if key.name not in names]
-        if len(common) >= 5 and len(left_out) <= 5:
+        if len(common) > max(2, len(left_out)):
             without = f" without {', '.join(left_out)}" if left_out else ""
             own = [key for key in keys if key not in common]
             return f"Keys as of **{name}**{without}{', and' if own else '.'}\n\n", own
@@ -96,12 +108,10 @@ def refer_to_others(keys: Keys, shown: dict[str, Keys]) -> tuple[str, Keys]:
 
 def format_keys(keys: Keys) -> str:
     """Return a table of keys, or a list if none has a meaning."""
-    rows = merge_rows((f"`{k.name}`", _hold(k), k.default, k.meaning) for k in keys)
+    rows = merge_rows((f"`{k.name}`", k.holds, k.meaning) for k in keys)
     if any(key.meaning for key in keys):
-        return format_table(("key", "holds", "default", "meaning"), rows)
-    return "".join(
-        f"- {name}: {holds}{default and f' ({default})'}\n" for name, holds, default, _ in rows
-    )
+        return format_table(("key", "holds (default)", "meaning"), rows)
+    return "".join(f"- {name}: {holds}\n" for name, holds, _ in rows)
 
 
 def merge_rows(rows: Iterable[tuple[str, ...]]) -> list[tuple[str, ...]]:
@@ -113,8 +123,11 @@ def merge_rows(rows: Iterable[tuple[str, ...]]) -> list[tuple[str, ...]]:
 
 
 def _hold(key: file_reference.Key) -> str:
-    """Return what a key holds, with `axis` for a letter with a sign or a vector."""
-    return key.holds.replace(AXIS, "axis")
+    """Return what a key holds, in the words of the page, and its default."""
+    holds = f"{key.holds} ({key.default})" if key.default else key.holds
+    for long, word in WORDS.items():
+        holds = holds.replace(long, word)
+    return holds
 
 
 def format_common() -> str:
@@ -129,7 +142,7 @@ def list_common_records() -> tuple[type, ...]:
     """Return the records that several families use."""
     nested = (list_nested_records(family) for family in FAMILIES.values())
     counts = Counter(record for records in nested for record in records)
-    return tuple(record for record, count in counts.items() if count > 1)
+    return tuple(r for r, count in counts.items() if count > 1 and r not in SPREADS)
 
 
 def format_families() -> str:
@@ -145,7 +158,8 @@ def format_families() -> str:
             f"### `family: {name}`\n\n{summarize(family)}\n\n{format_record(family, shared, shown)}"
         )
         shown[f"family: {name}"] = shown.pop(file_reference.name_record(family))
-        sections += [_format_nested(record, shown) for record in records if record not in common]
+        own = [record for record in records if record not in (*common, *SPREADS)]
+        sections += [_format_nested(record, shown) for record in own]
     return "\n".join(sections)
 
 
@@ -171,16 +185,19 @@ def format_kinds() -> str:
     sections = [f"### Settings of several kinds\n\n{format_table(header, rows)}"]
     for name, kind in KINDS.items():
         shown: dict[tuple[str, ...], tuple[str, str, str]] = {}  # of equal columns the first
-        for example in map(_describe_example, kind.examples()):
+        for example in map(_describe_example, filter(_has_one_target, kind.examples())):
             shown.setdefault(example[1:], example)
         examples = list(shown.values())
         parts = [f"### `kind: {name}`\n\n{summarize(kind)}\n"]
-        if any(map(any, examples)):
-            parts += [format_table(("settings", "columns", "noise of"), examples)]
+        if len(examples) > 1:
+            parts += [format_table(("settings", "columns", "noise of, if of others"), examples)]
+        elif any(examples[0]):
+            _, columns, noise = examples[0]
+            parts += [f"Columns: {columns}." + f" Noise of {noise}." * bool(noise) + "\n"]
         shared = [f"`{key}`" for key, words in meanings[name].items() if (key, words) in common]
         items = ", ".join(f"`{item}`" for item in kind.allowed_unknown)
         said = [f"Common settings: {', '.join(shared)}."] * bool(shared)
-        said += [f"`unknown` can list {items}."] * ("," in items)
+        said += [f"`unknown`: {items}."] * ("," in items)
         parts += [" ".join(said) + "\n"] * bool(said)
         own = merge_rows((f"`{k}`", w) for k, w in meanings[name].items() if (k, w) not in common)
         sections.append("\n".join([*parts, *([format_table(header, own)] if own else [])]))
@@ -202,6 +219,11 @@ def _word(meaning: str) -> str:
     return words if words.startswith("T_") else words[:1].upper() + words[1:]
 
 
+def _has_one_target(kind: Kind) -> bool:
+    """Return whether columns lack the names of targets, which the setting `targets` explains."""
+    return len(getattr(kind, "targets", ())) < 2
+
+
 def _describe_example(kind: Kind) -> tuple[str, str, str]:
     """Return settings, columns and noise columns of an example."""
     stated = []
@@ -217,7 +239,7 @@ def _describe_example(kind: Kind) -> tuple[str, str, str]:
                 f"{value if isinstance(value, str) else '[' + ', '.join(value) + ']'}`"
             )
     columns, noise = _describe_columns(kind.columns), _describe_columns(kind.noise_columns)
-    return ", ".join(stated), columns, "the columns" if noise and noise == columns else noise
+    return ", ".join(stated), columns, "" if noise == columns else noise
 
 
 def _describe_columns(columns: Iterable[Column]) -> str:
