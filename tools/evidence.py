@@ -147,11 +147,21 @@ def read_seconds(script: Path) -> float:
 
 
 def render_table(table: dict[str, Any]) -> str:
-    """Return a Markdown table; a missing value is a dash."""
-    columns = table["columns"]
-    formats = table.get("formats", [""] * len(columns))
-    rows = (zip(row, formats, strict=True) for row in table["rows"])
-    return format_table(columns, [[_render_cell(*cell) for cell in row] for row in rows])
+    """Return a Markdown table; a missing value is a dash. Above it stand the columns in which
+    three rows or more are equal.
+    """
+    names = table["columns"]
+    formats = table.get("formats", [""] * len(names))
+    rows = [list(map(_render_cell, row, formats)) for row in table["rows"]]
+    columns = list(zip(names, zip(*rows, strict=True), strict=True)) if rows else []
+    equal = [(name, cells[0]) for name, cells in columns if len(rows) > 2 and len({*cells}) == 1]
+    if not equal:
+        return format_table(names, rows)
+    own = [(name, cells) for name, cells in columns if (name, cells[0]) not in equal]
+    said = ", ".join(f"*{name}* {cell}" for name, cell in equal)
+    return f"In all rows: {said}.\n\n" + format_table(
+        [name for name, _ in own], zip(*(cells for _, cells in own), strict=True)
+    )
 
 
 def _render_cell(value: Any, spec: str) -> str:
