@@ -21,6 +21,8 @@ WORDING = ROOT / "tests" / "findings" / "wording.txt"
 
 SENTENCE_END = re.compile(r"(?<=[.?]) (?=[A-Z`'{]|loopcal)")
 PLACEHOLDER = re.compile(r"\{(?P<name>\w+)[^{}]*\}")
+WORD = re.compile(r"(?:\*[^*]*\*|`[^`]*`|[^\s*`])+")
+SHOWN_WORDS = 8  # of the first sentence of a message
 SEVERITIES = {
     Severity.INFO: "worth knowing. The result is usable as it is",
     Severity.SUGGESTION: "a step that would improve the result",
@@ -39,19 +41,20 @@ is the text, and an error has the `code` of its finding. In JSON, the keys are `
 `data` and `text`.
 
 Most messages say what happened and what to do, so this page only lists their codes by severity
-([all texts](../tests/findings/wording.txt)). The tables have the others: the first sentence, then
-what the message leaves out, its condition and what to do. Words in *italics* stand for data, and
-sentences in quotation marks are examples. A sentence that begins with a small letter is a part of
-another message.
+([all texts](../tests/findings/wording.txt)). The tables have the others: how the message begins,
+then what it leaves out, its condition and what to do. Words in *italics* stand for data, and texts
+in quotation marks are examples.
 """
 
 
 def describe_text(entry: Entry) -> str:
-    """Return the first sentence of an entry: placeholders in italics, or an example."""
+    """Return how a text begins: placeholders in italics, or an example in quotation marks."""
     first = SENTENCE_END.split(entry.word_example(), maxsplit=1)[0]
-    if depends_on_data(entry.text):
-        return f'"{first}"'
-    return PLACEHOLDER.sub(lambda match: f"*{match['name'].replace('_', ' ')}*", first)
+    if not depends_on_data(entry.text):
+        first = PLACEHOLDER.sub(lambda match: f"*{match['name'].replace('_', ' ')}*", first)
+    words = WORD.findall(first)
+    begin = first if len(words) <= SHOWN_WORDS + 2 else f"{' '.join(words[:SHOWN_WORDS])} ..."
+    return f'"{begin}"' if depends_on_data(entry.text) else begin
 
 
 def describe_circumstances(entry: Entry) -> str:
