@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Check-ups of calibrated machines: false alarms within a year, and changes that are found.
 
-Machines are drawn from their tolerances, calibrated at random poses and checked at five planned
+Machines are drawn from their spreads, calibrated at random poses and checked at five planned
 ones, or at five random ones. The instrument stands elsewhere at each check. A change moves one
 parameter, drawn at random, by so many tolerances.
 """

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The companion while measuring: how often it doubts rows, and how many poses a goal takes.
 
-Machines are drawn from the tolerances of the robot file. Each session measures the suggested poses
+Machines are drawn from the spreads of the robot file. Each session measures the suggested poses
 until the goal is reached. A tenth of its rows is wrong in one value, by six standard deviations of
 the difference from the expected value, which the companion shows. The true error is that of the
 machine with the estimate at the end of the session, in the frame of the plan.

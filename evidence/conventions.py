@@ -45,7 +45,7 @@ Change = Callable[[np.ndarray], np.ndarray]
 
 
 def simulate_data(robot: Mechanism, kind: Kind, times: float, seed: int) -> Measurements | None:
-    """Simulate a machine with errors of `times` its tolerances.
+    """Simulate a machine with errors of `times` its spreads.
 
     None if the kind does not apply or a pose is out of reach.
     """

@@ -94,7 +94,7 @@ def make_instrument(case: Case, noise: float) -> Instrument:
 
 
 def simulate_fits(case: Case, count: int) -> Iterator[Outcome]:
-    """Simulate and identify `count` machines drawn from the tolerances, in batches."""
+    """Simulate and identify `count` machines drawn from the spreads, in batches."""
     robot = load_robot(case.robot)
     coordinates, elsewhere = (
         sample_workspace(robot, case.poses, SEED).coordinates,

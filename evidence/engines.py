@@ -236,7 +236,7 @@ def compare_functions() -> dict[str, Any]:
 def compare_fits() -> dict[str, Any]:
     """Return the largest deviations of estimates and of their standard deviations.
 
-    Estimates differ in standard deviations, and in tolerances where these are infinite.
+    Estimates differ in standard deviations, and in spreads where these are infinite.
     """
     rows = []
     for method, value in METHODS.items():

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Reported errors of calibrated machines against their true errors, for five instrument set-ups.
 
-Each set-up is planned, machines are drawn from their tolerances, measured at the planned poses and
+Each set-up is planned, machines are drawn from their spreads, measured at the planned poses and
 calibrated. Reported and true errors refer to the same frame: after the best rigid fit of what the
 instrument does not determine.
 """

@@ -2,7 +2,7 @@
 """A scale error of the instrument: how often the stated uncertainty contains the error of poses.
 
 The lengths of simulated measurements are multiplied by 1 + s, s drawn anew for each machine from a
-normal distribution, and the machine from its tolerances. The instrument has noise of 3 um (30 urad)
+normal distribution, and the machine from its spreads. The instrument has noise of 3 um (30 urad)
 and a known frame; each fit takes 30 poses, and 30 others test it. Four sessions of the gantry have
 one scale, or each its own, and either is stated.
 """

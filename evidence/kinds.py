@@ -300,7 +300,7 @@ def compare_along_gauge(fit: Identification, data: Measurements, truth: Array) -
 class Coverage:
     """Which 95 % intervals of t fits contain the truth.
 
-    directions : combinations of parameters that the data know better than the tolerances.
+    directions : combinations of parameters that the data know better than the spreads.
         parameters : (t, p).
     setup : (t, U) frames, targets, surfaces and offsets. Intervals that are infinite are left out.
     """
@@ -314,7 +314,7 @@ class Coverage:
 def compute_coverage(
     case: Case, fits: int = FITS, noise: type[Gaussian] = Gaussian, seed: int = SEED
 ) -> Coverage:
-    """Simulate machines drawn from their tolerances, identify by MAP and compare with the truth."""
+    """Simulate machines drawn from their spreads, identify by MAP and compare with the truth."""
     robot, rng = load_machine(case), np.random.default_rng(seed)
     coordinates = _coordinates(case.robot, seed)[:POSES]
     looking = make_instrument(case.kind, POSES, noise)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tolerances that are stated too small, and parameters far from nominal, alone or together: how
+"""Spreads that are stated too small, and parameters far from nominal, alone or together: how
 often the conflict is reported, what the default fit loses by it, and what its intervals cover.
 """
 
@@ -35,7 +35,7 @@ METHODS: dict[str, Method] = {
 
 
 def narrow_tolerances(robot: Mechanism, factor: float) -> Mechanism:
-    """Return the robot with its tolerances divided by a factor."""
+    """Return the robot with its spreads divided by a factor."""
     entries = (
         replace(p, tolerance=None if p.tolerance is None else p.tolerance / factor)
         for p in robot.parameters.entries
@@ -103,7 +103,7 @@ def _compare(
 
 
 def _reports_conflict(fit: Identification) -> bool:
-    """Return whether a fit reports that data and tolerances contradict each other."""
+    """Return whether a fit reports that data and spreads contradict each other."""
     return fit.prior_conflict is not None and bool(fit.prior_conflict.report())
 
 

@@ -3,7 +3,7 @@
 random poses are as good as planned ones. And the share of machines that end below the error that a
 plan states, from the fewest possible poses on.
 
-Machines are drawn from their tolerances and measured with noise, at planned poses and at poses
+Machines are drawn from their spreads and measured with noise, at planned poses and at poses
 drawn evenly from the workspace. They are calibrated by the default method and validated at other
 poses of the workspace. One plan, made for the nominal machine, serves all machines. Every seed
 draws its own random poses; the first n of them are its set of n.
@@ -270,7 +270,7 @@ def count_below(case: Case) -> list[list]:
     """Return for each number of poses what a plan states of position errors, and how many machines
     end below it.
 
-    Machines are drawn from their tolerances, measured at the planned poses and calibrated. Their
+    Machines are drawn from their spreads, measured at the planned poses and calibrated. Their
     errors are those at other poses of the workspace, in the frame of the plan.
     """
     robot = load_robot(case.robot)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A machine that calibrates itself: the belt robot from 100 poses of readings alone, repeated.
 
-One machine, drawn from the tolerances, is measured again and again. Its readings determine nine of
+One machine, drawn from the spreads, is measured again and again. Its readings determine nine of
 twelve combinations of parameters. In the coordinates in which a fit calls their errors independent
 and of variance one, the spread of the repeats must be one in every direction, and chi-square must
 be that of its degrees of freedom.
@@ -31,7 +31,7 @@ BAND = 0.99
 
 
 def measure_repeatedly(robot: Mechanism, repeats: int, poses: int) -> Trials:
-    """Return repeats of the measurement of one machine that is drawn from the tolerances."""
+    """Return repeats of the measurement of one machine that is drawn from the spreads."""
     truth = np.repeat(sample_truth(robot, 1, SEED), repeats, axis=0)
     coordinates = sample_workspace(robot, poses, SEED).coordinates
     return simulate_trials(robot, truth, coordinates, READINGS, SEED)

@@ -129,7 +129,7 @@ def _to_content(value: Any) -> Any:
 
 @cache
 def measure_robot(name: str) -> Measurements:
-    """Return positions of three targets on a robot with the errors of its tolerances."""
+    """Return positions of three targets on a robot with the errors of its spreads."""
     robot = load_cached_robot(name)
     true = robot.with_values(sample_truth(robot, 1, 5)[0])
     kind = Position(targets=("a", "b", "c"), places=CORNERS, unknown=("frame",), frame="tracker")

@@ -172,7 +172,7 @@ def test_plain_options_that_do_not_fit_are_refused(plain, sentence) -> None:
 
 @dataclass(frozen=True)
 class Doubled(lc.MAP):
-    """A method of another package: twice the tolerances."""
+    """A method of another package: twice the spreads."""
 
     name: ClassVar[str] = "doubled"
     inflation: Any = 2.0

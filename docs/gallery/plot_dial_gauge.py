@@ -27,7 +27,7 @@ setup = {"plate.u": np.radians(0.2), "plate.v": np.radians(-0.1), "plate.height"
 
 # %%
 # Flatness says little about size. The radius and the arms are hardly better known than from the
-# drawing: many combinations have a singular value below 1, which is the weight of the tolerances.
+# drawing: many combinations have a singular value below 1, the weight of the expected spreads.
 
 data = lc.simulate(machine, poses, lc.Instrument((gauge,)), seed=2, nuisance_values=setup)
 result = lc.identifiability(robot, data)
@@ -57,6 +57,6 @@ for name, measured in {"gauge": data, "gauge and calipers": both}.items():
     )
 
 # %%
-# With the calipers, the arms are known to a fraction of their tolerance.
+# With the calipers, the arms are known to a fraction of their expected spread.
 
 report.identification.plot.parameters()

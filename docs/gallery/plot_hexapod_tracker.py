@@ -11,8 +11,8 @@ The machine is simulated, so the result can be compared with the truth.
 """
 
 # %%
-# The robot file states the drawing and its tolerances. The true machine deviates from the
-# drawing; here its errors are drawn from the tolerances.
+# The robot file states the drawing and its expected spreads. The true machine deviates from the
+# drawing; here its errors are drawn from the expected spreads.
 
 # sphinx_gallery_thumbnail_path = "docs/pictures/thumbnails/hexapod_tracker.png"
 import numpy as np

@@ -82,7 +82,7 @@ print(ridge.regularization)
 # %%
 # **Your own estimator.** ``lc.forward`` and ``lc.jacobian`` are all that an optimizer needs. This
 # one minimizes absolute values, nearly. Without a loss, it agrees with loopcal's least squares.
-# Neither knows the tolerances, so both are further from the truth than the fits above.
+# Neither knows the expected spreads, so both are further from the truth than the fits above.
 
 sigma = 20e-6
 

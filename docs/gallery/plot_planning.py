@@ -29,8 +29,8 @@ print(plan)
 plan.plot()
 
 # %%
-# Is it true? Draw 40 machines from the tolerances, measure each at the planned poses and at as many
-# random ones, and compare the calibrated machines with the true ones at 30 other poses.
+# Is it true? Draw 40 machines from the expected spreads, measure each at the planned poses and at
+# as many random ones, and compare the calibrated machines with the true ones at 30 other poses.
 
 truth = lc.sample_truth(robot, 40, seed=1)
 chosen = plan.poses.coordinates[~plan.poses.held_out]

@@ -10,7 +10,8 @@ computes both, each with the interval that thirty visits leave.
 
 # %%
 # The simulated delta robot scatters by 10 um in x, y and z, and its geometry has errors of the
-# size of its tolerances. The tracker is five times better than the scatter, as the standard asks.
+# size of its expected spreads. The tracker is five times better than the scatter. The standard
+# asks for four.
 
 # sphinx_gallery_thumbnail_path = "docs/pictures/thumbnails/repeatability.png"
 import numpy as np

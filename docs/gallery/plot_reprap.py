@@ -76,7 +76,7 @@ data = lc.load_measurements(folder / "heights.csv", robot)
 # %%
 # With the rods free, three combinations of the nine numbers are known no better than from their
 # tolerances: their singular values are below 1. The colors show which: the rods, with some radius
-# and tower angles. A fit without tolerances moves along them at every run.
+# and tower angles. A fit without expected spreads moves along them at every run.
 
 free = lc.load_robot("linear-delta")
 result = lc.identifiability(free, replace(data, robot_name=free.name))
@@ -109,7 +109,7 @@ both = lc.Measurements(
 )
 
 # %%
-# Now all nine numbers are free, and each rod is held by its tolerance.
+# Now all nine numbers are free, and each rod is held by its expected spread.
 
 fit = lc.identify(free, both)
 fit.plot.parameters()

@@ -3,9 +3,9 @@
 Which probe, and how many points? A small study
 ===============================================
 
-Before you buy a probe, simulate it: a study draws many machines from the tolerances, measures and
-calibrates each of them, and compares the result with the truth. This one takes a second. It asks
-how many points a delta robot needs with a cheap and with a good camera.
+Before you buy a probe, simulate it: a study draws many machines from the expected spreads,
+measures and calibrates each of them, and compares the result with the truth. This one takes a
+second. It asks how many points a delta robot needs with a cheap and with a good camera.
 """
 
 # %%

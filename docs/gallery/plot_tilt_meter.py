@@ -31,7 +31,7 @@ poses = lc.sample_workspace(robot, 60, seed=1).coordinates
 setup = {"level.rx": np.radians(0.4), "level.rz": np.radians(1.5), "gravity.u": np.radians(-0.1)}
 
 # %%
-# The level alone, and the level with the gauge: which share of each tolerance is left?
+# The level alone, and the level with the gauge: which share of each expected spread is left?
 
 for name, sensors in {"level alone": (level,), "level and gauge": (level, gauge)}.items():
     data = lc.simulate(machine, poses, lc.Instrument(sensors), 2, nuisance_values=setup)

@@ -31,7 +31,7 @@ class Setup:
     columns : what is measured: coordinates, or nothing for full poses.
     poses : measured. few : poses that leave 6 degrees of freedom.
     sigma : (length [m], angle [rad]) of the instrument. coarse : the same of an instrument with
-        which the tolerances matter.
+        which the spreads matter.
     group : end of the names of the parameters that a batch shifts together.
     """
 
@@ -65,8 +65,8 @@ class Case:
     outliers : share of the poses that are 20 sigma off. drift, jump : displacement of the
         instrument from the first to the last pose, or from the first session to the second, in
         sigma. smooth : model error over the workspace [m].
-    tolerance : true errors over stated tolerances. single, group : deviation of one parameter, or
-        of the parameters of a batch, in tolerances.
+    tolerance : true errors over stated spreads. single, group : deviation of one parameter, or
+        of the parameters of a batch, in spreads.
     is_coarse : whether the instrument is the coarse one. is_few : whether the poses leave 6 degrees
         of freedom. estimated : whether the noise is estimated. least_squares : the method.
     """

@@ -46,7 +46,7 @@ class Parameter:
 class CommonError:
     """An error that several parameters share: that of one batch of arms, or of a common zero.
 
-    Each of them deviates by its own error, of its own tolerance, plus the same common error.
+    Each of them deviates by its own error, of its own spread, plus the same common error.
 
     name : e.g. `batch of rods`. parameters : names of those that share it, of one dimension.
     tolerance : standard deviation of the common error [SI].
@@ -102,7 +102,7 @@ class ParameterTable:
 
     @cached_property
     def tolerance(self) -> FloatArray:
-        """Tolerances (p,) as standard deviations [SI], NaN if none is stated.
+        """Spreads (p,) as standard deviations [SI], NaN if none is stated.
 
         They are those of the whole deviation: sqrt(own^2 + sum of common^2).
         """

@@ -83,7 +83,7 @@ def to_frame(points, frame):
 
 
 def fit_densely(data, is_known):
-    """Return the unknowns (9 + 12 + 9,) of the dense fit with tolerances, and their covariance."""
+    """Return the unknowns (9 + 12 + 9,) of the dense fit with spreads, and their covariance."""
     moving, base = data.observations[0], data.base_observations[0]
 
     def residual(x):

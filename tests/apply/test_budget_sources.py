@@ -43,7 +43,7 @@ ROUNDING = 1e-6
 
 @cache
 def delta() -> Mechanism:
-    """Return a robot with tolerances whose fit is fast."""
+    """Return a robot with spreads whose fit is fast."""
     return lc.load_robot("linear-delta")
 
 
@@ -69,7 +69,7 @@ def budget_of(fit: Identification, data: Measurements, frame: str = "fitted") ->
 
 
 def measured(robot: Mechanism, *sensors: Sensor, poses: int = 25, seed: int = 1) -> Measurements:
-    """Return simulated measurements of a machine drawn from the tolerances."""
+    """Return simulated measurements of a machine drawn from the spreads."""
     machine = robot.with_values(sample_truth(robot, 1, seed)[0])
     return simulate(
         machine, sample_workspace(robot, poses, 7).coordinates, Instrument(sensors), seed

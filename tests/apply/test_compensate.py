@@ -23,7 +23,7 @@ ROBOTS = ("hexapod-42", "3-prs", "linear-delta", "ru-pus-prs", "five-bar")
 
 
 def make_identified_robot(name, seed=1):
-    """Return a robot with random errors of its tolerances (default 0.1 mm and 0.1 mrad)."""
+    """Return a robot with random errors of its spreads (default 0.1 mm and 0.1 mrad)."""
     robot = load_robot(name)
     spread = np.nan_to_num(robot.parameters.tolerance, nan=1e-4)
     return robot.with_values(

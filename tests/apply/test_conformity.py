@@ -196,7 +196,7 @@ def collect_statements(count: int) -> np.ndarray:
     """Stated probabilities, and whether the truth conforms, for limits near the measured error and
     the true one.
 
-    Each machine has errors within its tolerances, and is calibrated and validated by measurements
+    Each machine has errors within its spreads, and is calibrated and validated by measurements
     with noise; half of the calibrations leave errors of the arms in the machine. The true error is
     the one of the same poses without the noise of the validation.
     """

@@ -16,7 +16,7 @@ READINGS = TableSize("readings", 256, 256)
 
 
 def disturb(robot: lc.Mechanism, seed: int = 1) -> lc.Mechanism:
-    """Return a robot with errors of its tolerances."""
+    """Return a robot with errors of its spreads."""
     scale = np.nan_to_num(robot.parameters.tolerance) * robot.parameters.free
     errors = np.random.default_rng(seed).standard_normal(len(scale))
     return robot.with_values(robot.values + scale * errors)

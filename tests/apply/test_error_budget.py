@@ -38,7 +38,7 @@ THREE = np.array([[0.03, -0.02, 0.05], [-0.04, 0.02, 0.05], [0.0, 0.05, 0.06]])
 
 @cache
 def robot() -> Mechanism:
-    """Return the hexapod of the library, which states its workspace and tolerances."""
+    """Return the hexapod of the library, which states its workspace and spreads."""
     return lc.load_robot("hexapod-42")
 
 
@@ -96,7 +96,7 @@ def test_total_is_the_pose_uncertainty_and_the_variances_add_up(frame):
         assert sources.rms == pytest.approx(np.sqrt((expected**2).mean()), rel=1e-9)
         assert min(sources.instrument, sources.setup, sources.tolerances) > 0.0
     assert budget.is_workspace
-    if frame == "base":  # the unknown frame leaves the place of the base to its tolerances
+    if frame == "base":  # the unknown frame leaves the place of the base to its spreads
         assert budget.position.setup > 0.9 * sum(budget.position)
 
 

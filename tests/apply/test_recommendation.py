@@ -159,7 +159,7 @@ def test_residuals_beyond_the_noise_leave_the_values_and_finite_intervals(printe
 
 
 def test_seven_heights_of_a_right_printer_show_no_errors_of_the_model(printer) -> None:
-    """Deviations from nominal far below the tolerances are no sign of errors of the model."""
+    """Deviations from nominal far below the spreads are no sign of errors of the model."""
     for seed in range(6):
         data = probe_seven(printer, 0.0, seed)
         fit = adjust_uncertainty(identify(printer, data), data)

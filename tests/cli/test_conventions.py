@@ -14,7 +14,7 @@ from loopcal.io.robot.robot_file import list_shipped_robots
 
 
 def write_simulated_data(path, kind, n=9, seed=0, change=None, unknowns=None):
-    """Write simulated measurements of a hexapod within its tolerances."""
+    """Write simulated measurements of a hexapod within its spreads."""
     robot = lc.load_robot("hexapod-42")
     truth = robot.with_values(
         robot.values + 0.03e-3 * np.random.default_rng(0).standard_normal(len(robot.values))
@@ -152,7 +152,7 @@ def test_prior_or_fixed_value_that_contradicts_the_data_is_refused_by_name(
         err = state(statement, "frame.x at ", shown, "--allow-implausible", code=1)
         assert err.startswith("loopcal: stated.csv: ")
     state("frame.x: {start: 101 mm, sd: 1 mm}")
-    # noted: a robot far off its tolerances shows the same
+    # noted: a robot far off its spreads shows the same
     state("frame.x: {start: 105 mm, sd: 10 um}", "note: stated.csv: ", "frame.x at 100")
 
 

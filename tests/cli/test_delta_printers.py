@@ -312,7 +312,7 @@ def test_nine_parameters_from_heights_alone_are_refused_with_a_suggestion(
         "Hint: use --method map",
         code=1,
     )
-    # where stated tolerances fill the gap, the note is printed and kept in the run
+    # where stated spreads fill the gap, the note is printed and kept in the run
     (tmp_path / "nine.yaml").write_text((tmp_path / "nine.yaml").read_text() + TOLERANCES)
     assert (
         "Suggested measurement"

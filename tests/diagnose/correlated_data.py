@@ -41,7 +41,7 @@ def measure(
     session: np.ndarray | None = None,
     context: Mapping[str, np.ndarray] | None = None,
 ) -> tuple[np.ndarray, Measurements]:
-    """Return the true values of a machine drawn from the tolerances, and its measurements with
+    """Return the true values of a machine drawn from the spreads, and its measurements with
     errors (n, m) in units of the stated noise.
     """
     machine, sensor = ROBOTS[robot], SENSORS[kind]

@@ -35,7 +35,7 @@ CASES = {
 
 
 def linear_delta(poses: int = 14, seed: int = 0) -> tuple[lc.Mechanism, lc.Measurements]:
-    """Return the shipped delta and positions of a machine drawn from its tolerances."""
+    """Return the shipped delta and positions of a machine drawn from its spreads."""
     robot = lc.load_robot("linear-delta")
     truth = robot.with_values(lc.sample_truth(robot, 1, seed)[0])
     sensor = lc.Sensor(lc.Component(("x", "y", "z")), lc.Gaussian(np.full(3, 20 * UM)))

@@ -51,7 +51,7 @@ PAIR = np.array([[0.1, 0.0, 0.02], [-0.05, 0.08, 0.02]])
 def simulate_data(
     name: str, kind: Kind, n: int = 10, times: float = 1.0, seed: int = 0
 ) -> Measurements:
-    """Simulate a machine whose errors are `times` its tolerances, commanded by nominal geometry."""
+    """Simulate a machine whose errors are `times` its spreads, commanded by nominal geometry."""
     robot, noise = (
         load_cached_robot(name),
         Gaussian(np.array([SIGMA[c.dimension] for c in kind.noise_columns])),

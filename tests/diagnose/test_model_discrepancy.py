@@ -48,7 +48,7 @@ SIGMA = 10 * UM
 
 @cache
 def delta() -> Mechanism:
-    """Return a robot whose fit is fast, with stated tolerances and workspace."""
+    """Return a robot whose fit is fast, with stated spreads and workspace."""
     return lc.load_robot("linear-delta")
 
 

@@ -25,7 +25,7 @@ SIGMA = 0.1  # [px]
 
 @cache
 def measure():
-    """Return a hexapod with errors of its tolerances, and 16 pictures of its board."""
+    """Return a hexapod with errors of its spreads, and 16 pictures of its board."""
     robot = load_robot("hexapod-42")
     half, middle = np.array([30, 30, 15, 10, 10, 10]), np.array([0, 0, 200, 0, 0, 0])
     poses = middle + np.random.default_rng(3).uniform(-half, half, (16, 6))

@@ -27,7 +27,7 @@ from tests.estimate.problems import MM, UM, hexapod, hexapod_data
 from tests.estimate.uncertain_reading_problems import simulate_hexapod
 
 EXACT = FitOptions(method=lc.MAP(), sigma_uncertainty=0.0)
-"""Options with tolerances as the prior and sigmas that are exact, as in the reference."""
+"""Options with spreads as the prior and sigmas that are exact, as in the reference."""
 
 
 def delta(
@@ -79,7 +79,7 @@ def find_nozzle(values: np.ndarray, readings: np.ndarray) -> np.ndarray:
 def sample_by_walkers(
     robot: Mechanism, data: lc.Measurements, sigma: float, start: np.ndarray, steps: int
 ) -> np.ndarray:
-    """Draw deviations (m, p) in tolerances from the posterior by the stretch move of Goodman and
+    """Draw deviations (m, p) in spreads from the posterior by the stretch move of Goodman and
     Weare (2010), with closed kinematics; `start` (walkers, p).
     """
     places = np.flatnonzero(robot.parameters.free)

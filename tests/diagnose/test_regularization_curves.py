@@ -26,7 +26,7 @@ def robot() -> Mechanism:
 
 
 def measure(robot: Mechanism, kind: Position, n: int = 16) -> Measurements:
-    """Return measurements of a machine with errors within its tolerances."""
+    """Return measurements of a machine with errors within its spreads."""
     truth = robot.with_values(sample_truth(robot, 1, 4)[0])
     instrument = Instrument((Sensor(kind, noise(*[60e-6] * 3)),))
     return simulate(truth, sample_workspace(robot, n, 5).coordinates, instrument, 6)
@@ -94,7 +94,7 @@ def test_curves_begin_and_end_at_the_given_robot_and_at_least_squares(robot, dat
 
 
 def test_tolerances_that_are_right_give_the_lowest_error_near_lam_1(robot) -> None:
-    """Machines that are drawn from the tolerances are predicted best with lam = 1 on average."""
+    """Machines that are drawn from the spreads are predicted best with lam = 1 on average."""
     total: dict[float, float] = {}
     instrument = Instrument((Sensor(Position(), noise(*[2e-3] * 3)),))
     poses = sample_workspace(robot, 8, 5).coordinates

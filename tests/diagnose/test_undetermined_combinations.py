@@ -148,7 +148,7 @@ workspace: {x: [-100, 100], y: [-100, 100]}
 
 
 def measure_along_x(folder: Path, offset: float) -> tuple[Mechanism, Measurements]:
-    """Return the table, the offset of whose first slide has this tolerance [mm], and full poses
+    """Return the table, the offset of whose first slide has this spread [mm], and full poses
     with the second slide at rest.
     """
     path = folder / "table.yaml"

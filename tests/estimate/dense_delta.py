@@ -43,7 +43,7 @@ def locate_nozzle(values, readings):
 
 
 def differentiate(values, readings):
-    """Return positions and their derivatives (n, 3, 9) by the parameters, in tolerances."""
+    """Return positions and their derivatives (n, 3, 9) by the parameters, in spreads."""
     steps = 1e-30j * np.diag(TOLERANCE)
     slopes = [locate_nozzle(values + step, readings).imag / 1e-30 for step in steps]
     return locate_nozzle(values, readings), np.stack(slopes, axis=2)
@@ -52,7 +52,7 @@ def differentiate(values, readings):
 @dataclass(frozen=True)
 class DenseFit:
     """Estimates (9,) [SI], whitened residuals b (m,) = measured - predicted, and rows A (m, 9) in
-    tolerances.
+    spreads.
     """
 
     estimate: np.ndarray

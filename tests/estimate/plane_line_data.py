@@ -26,7 +26,7 @@ def plan_groups(groups: int = 12, points: int = 6, robot: str = ROBOT) -> Surfac
 def simulate_plan(
     plan: SurfacePlan, sigma: float, seed: int, errors: float = 1.0
 ) -> tuple[Mechanism, Measurements]:
-    """Return a true machine and its measurements with this noise [m]; errors in tolerances."""
+    """Return a true machine and its measurements with this noise [m]; errors in spreads."""
     robot = plan.robot
     drawn = sample_truth(robot, 1, seed)[0] - robot.values
     truth = robot.with_values(robot.values + errors * drawn)

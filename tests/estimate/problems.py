@@ -47,7 +47,7 @@ def probe(sigma: float = 5 * UM) -> Instrument:
 
 
 def with_tolerance(robot: Mechanism, tolerance: float) -> Mechanism:
-    """Return the robot with one tolerance [SI] for all parameters."""
+    """Return the robot with one spread [SI] for all parameters."""
     entries = tuple(replace(p, tolerance=tolerance) for p in robot.parameters.entries)
     return replace(robot, parameters=ParameterTable(entries))
 

@@ -16,7 +16,7 @@ FIELDS = tuple(field.name for field in dataclasses.fields(lc.Identification))
 
 def measure(n: int = 12, kind: lc.Kind | None = None, times: float = 1.0, **changes):
     """Return a hexapod and simulated measurements of one whose errors are so many times those that
-    its tolerances let expect.
+    its spreads let expect.
     """
     robot = lc.load_robot("hexapod-42")
     rng = np.random.default_rng(3)

@@ -25,7 +25,7 @@ HEXAPOD, DELTA = load_robot("hexapod-42"), load_robot("rotary-delta")
 
 
 def simulate(robot: Mechanism, count: int, poses: int, factor: float = 1.0, kind=None) -> Trials:
-    """Return measurements of machines whose errors are `factor` times those of the tolerances."""
+    """Return measurements of machines whose errors are `factor` times those of the spreads."""
     kind = Pose() if kind is None else kind
     truth = robot.values + factor * (sample_truth(robot, count, 2) - robot.values)
     noise = Gaussian(np.full(len(kind.noise_columns), 1e-5))

@@ -92,7 +92,7 @@ def test_a_correlated_prior_gives_the_solution_of_the_normal_equations(
 
 
 def test_a_batch_that_is_off_is_found_by_whoever_declares_it(delta: Mechanism) -> None:
-    """All rods of a delta are 0.5 mm too long, five of their own tolerances."""
+    """All rods of a delta are 0.5 mm too long, five of their own spreads."""
     plain = load_robot("rotary-delta")
     instrument = Instrument((Sensor(Component(("x", "y", "z")), Gaussian(np.full(3, 5e-5))),))
     held_out = sample_workspace(plain, 40, 99).solution.q
@@ -124,8 +124,8 @@ def test_a_batch_that_is_off_is_found_by_whoever_declares_it(delta: Mechanism) -
 
 
 def test_identifiability_uses_the_common_errors(delta: Mechanism) -> None:
-    """Standard deviations with the tolerances as a prior are those of dense normal equations, and
-    those of a fit. Independent tolerances would promise 10 % less or more.
+    """Standard deviations with the spreads as a prior are those of dense normal equations, and
+    those of a fit. Independent spreads would promise 10 % less or more.
     """
     instrument = Instrument((Sensor(Component(("x", "y", "z")), Gaussian(np.full(3, 5e-5))),))
     analysis = identifiability(delta, instrument, poses=20)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parts of the tolerances that are wider than stated: evidence, choice, and what the default fit
+"""Parts of the spreads that are wider than stated: evidence, choice, and what the default fit
 gains by them.
 """
 
@@ -58,7 +58,7 @@ def make_rows(seed: int = 0):
 
 
 def components_of(fit: Identification) -> tuple[ToleranceComponent, ...]:
-    """Return the parts of the tolerances that a fit inflated."""
+    """Return the parts of the spreads that a fit inflated."""
     assert isinstance(fit.method, MAP)
     return fit.method.components
 

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The descent: independence of trials, penalty on the total deviation, and a status for every
-ending. Fits that did not converge or left their tolerances state no noise, no intervals and no
+ending. Fits that did not converge or left their spreads state no noise, no intervals and no
 prior.
 """
 

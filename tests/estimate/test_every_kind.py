@@ -155,7 +155,7 @@ MACHINES, MINIMUM_WINS = 20, 17
 
 
 def compute_variances_and_errors(kinds):
-    """Return predicted variances and squared errors (MACHINES,) of parameters in tolerances."""
+    """Return predicted variances and squared errors (MACHINES,) of parameters in spreads."""
     robot = load_robot("hexapod-42")
     truth = sample_truth(robot, MACHINES, SEED)
     # 5 um and 5 urad: angles tell as much as lengths on a machine of this size

@@ -67,7 +67,7 @@ def test_only_the_part_of_the_variance_that_is_noise_has_its_degrees_of_freedom(
     by_noise = scale**2 * np.diag(inverse @ dense.A.T @ dense.A @ inverse)
     by_tolerances = np.diag(inverse @ inverse)
     total = by_noise + by_tolerances
-    # Welch-Satterthwaite: the tolerances are known
+    # Welch-Satterthwaite: the spreads are known
     effective = degrees * (total / by_noise) ** 2
     half = stats.t.ppf(0.975, effective) * np.sqrt(total) * TOLERANCE
     np.testing.assert_allclose(fit.standard_deviations, TOLERANCE * np.sqrt(total), rtol=1e-4)

@@ -81,7 +81,7 @@ def test_most_probable_factor_on_the_tolerances_maximizes_the_density_of_the_dat
 
 
 def test_inflated_tolerances_have_the_degrees_of_freedom_of_their_factor():
-    """Of the covariance B (A'A + I / factor^2) B the part of the tolerances has 1 / (2 spread^2)
+    """Of the covariance B (A'A + I / factor^2) B the part of the spreads has 1 / (2 spread^2)
     degrees of freedom; the estimate moves by the error of the factor, too.
     """
     case = Case("", tolerance=3.0, is_coarse=True)

@@ -53,7 +53,7 @@ def test_published_median_errors_of_the_default_are_not_worse_than_before(root):
 def test_published_errors_with_narrow_tolerances_are_near_least_squares(root):
     for robot, factor, *_, ratio, named in read_evidence_rows(root, "narrow_prior", "narrow"):
         assert ratio < 1.2, (robot, factor)
-        # at the true tolerances the tests may reject one fit in a hundred, and 4 % get a component
+        # at the true spreads the tests may reject one fit in a hundred, and 4 % get a component
         if factor >= 3.0:
             assert named == 100.0, (robot, factor)
         assert factor > 1.0 or named < 12.0, robot

@@ -261,7 +261,7 @@ def test_probability_of_a_change_is_uniform_with_known_and_estimated_noise(degre
 
 
 def test_the_pull_of_tolerances_is_no_error_of_what_data_say() -> None:
-    """The comparison contains no tolerance, so an inflated one must not widen it."""
+    """The comparison contains no spread, so an inflated one must not widen it."""
     robot = ROBOTS["linear-delta"]
     truth = draw_machine(robot, 7)
     fits = [identify(robot, measure(robot, truth, seed), LeastSquares()) for seed in (7, 107)]

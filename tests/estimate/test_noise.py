@@ -142,7 +142,7 @@ def test_variance_of_map_is_the_sandwich(scale):
 
 @pytest.mark.parametrize("lam", [pytest.param(3.0, marks=pytest.mark.evidence), 10.0])
 def test_intervals_of_a_ridge_contain_the_truth(lam):
-    """The bias is that of the stated tolerances, not of 1 / lam: coverage was 51 to 84 %."""
+    """The bias is that of the stated spreads, not of 1 / lam: coverage was 51 to 84 %."""
     robot, held = lc.load_robot("linear-delta"), []
     sensor = lc.Sensor(lc.Component(("x", "y", "z")), lc.Gaussian(np.full(3, 100 * UM)))
     for seed in range(20):
@@ -164,7 +164,7 @@ def test_a_ridge_without_stated_tolerances_has_no_intervals():
         assert not fit.residual_test.intervals
         (finding,) = (f for f in fit.findings if f.code == "fit.ridge-without-intervals")
         assert len(finding.data["names"]) == lacking
-    # where all that is penalized has a tolerance, there are intervals
+    # where all that is penalized has a spread, there are intervals
     assert np.isfinite(identify(hexapod(), data, Ridge(1.0)).standard_deviations).all()
     free = identify(zoo.hexapod(), data, Ridge((0.0,) * 42))
     assert np.isfinite(free.standard_deviations).all()

@@ -56,7 +56,7 @@ def measure(
     seed: int = 0,
     truth: Mechanism | None = None,
 ) -> Measurements:
-    """Return measurements at poses of a machine; default: one drawn from the tolerances."""
+    """Return measurements at poses of a machine; default: one drawn from the spreads."""
     if truth is None:
         truth = DELTA.with_values(sample_truth(DELTA, 1, 0)[0])
     return simulate(truth, poses, Instrument(sensors), seed)

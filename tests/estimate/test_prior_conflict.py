@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Stated tolerances that contradict the data: the conflict is reported, and the default method
+"""Stated spreads that contradict the data: the conflict is reported, and the default method
 inflates them.
 """
 

@@ -64,7 +64,7 @@ def true_setup_values(*kinds):
 
 
 def make_machine(name, n):
-    """Return a nominal robot, true values within its tolerances, and poses."""
+    """Return a nominal robot, true values within its spreads, and poses."""
     if name == "hexapod":
         return hexapod(), zoo.hexapod_truth(), hexapod_poses(n)
     robot = lc.load_robot(name)

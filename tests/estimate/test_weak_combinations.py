@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Combinations of parameters without a stated tolerance that the data determine too weakly: along
+"""Combinations of parameters without a stated spread that the data determine too weakly: along
 them the residuals are curved, so that the data alone have no best value.
 """
 
@@ -38,7 +38,7 @@ def load_complete(name: str) -> Mechanism:
 
 @cache
 def fit_machines(name: str, factor: float) -> tuple[FreeParameters, Trials, IdentifiedTrials]:
-    """Return free parameters, machines with errors of `factor` assumed tolerances, and fits."""
+    """Return free parameters, machines with errors of `factor` assumed spreads, and fits."""
     robot = load_complete(name)
     free = select_free_parameters(robot)
     z = np.random.default_rng(3).standard_normal((MACHINES, len(free)))
@@ -76,7 +76,7 @@ def test_uncertainties_cover_the_truth(name, factor):
     free, trials, fits = fit_machines(name, factor)
     sd = fits.standard_deviations()
     z = ((fits.values - trials.truth)[:, free.places] / sd)[np.isfinite(sd)]
-    # at five assumed tolerances the prior is right; smaller errors are within it
+    # at five assumed spreads the prior is right; smaller errors are within it
     assert np.sqrt(np.mean(z**2)) < 1.15
     if factor == HOLD:
         assert np.sqrt(np.mean(z**2)) > 0.8
@@ -99,7 +99,7 @@ def test_a_fit_names_what_it_held_and_leaves_null_combinations_unknown():
 
 
 def test_stated_tolerances_are_as_wide_with_held_parameters_as_without():
-    """The null direction of a stated parameter keeps its tolerance; one of others is unknown."""
+    """The null direction of a stated parameter keeps its spread; one of others is unknown."""
     free, _, fits = fit_machines("jansen-leg", 1.0)
     sd = fits.standard_deviations() / free.tolerance
     assert (sd[:, ~free.assumed] < 1.01).all()

@@ -24,7 +24,7 @@ from tests import zoo
 from tests.estimate.problems import UM, hexapod_poses, noise, with_tolerance
 
 DIFFERENCE_STEP = 1e-2
-"""Of the differences, in tolerances and sigmas: what is left of third order is 1e-4 of what
+"""Of the differences, in spreads and sigmas: what is left of third order is 1e-4 of what
 closure's curvature does.
 """
 

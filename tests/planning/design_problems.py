@@ -19,7 +19,7 @@ CASES = {
     for nuisance in (0, 2)
     for prior in (False, True)
 }
-"""Each criterion with and without nuisance parameters and tolerances."""
+"""Each criterion with and without nuisance parameters and spreads."""
 
 
 def draw_rows(N: int = 12, r: int = 2, nuisance: int = 0, machine: int = 4, seed: int = 0) -> Array:
@@ -34,7 +34,7 @@ def make_problem(
     prior: bool = False,
     repeats: bool = False,
 ) -> DesignProblem:
-    """Return a problem with or without the tolerances of the machine as the prior; by default D."""
+    """Return a problem with or without the spreads of the machine as the prior; by default D."""
     make = PriorInformation.from_tolerances if prior else PriorInformation.none
     start = make(rows.shape[2] - nuisance, nuisance)
     return DesignProblem(rows, criterion or Criterion("D"), start, repeats)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The companion judges rows by what is known, chooses poses and says how accurate the robot is.
 
-Rows are simulated: machines drawn from the tolerances, measured with the stated noise.
+Rows are simulated: machines drawn from the spreads, measured with the stated noise.
 """
 
 import time

@@ -90,7 +90,7 @@ def test_tolerance_prior_changes_the_design_only_for_coarse_data():
         designs = [choose_design(problem, 20, perturbations=5) for problem in (plain, bayes)]
         value, other = (plain.evaluate(design.chosen) for design in designs)
         kept.append(plain.compare(other, value))
-    # with coarse data other poses are better: what the tolerances say need not be measured
+    # with coarse data other poses are better: what the spreads say need not be measured
     assert kept[0] < 0.9
     assert 0.98 < kept[1] < 1.02
 

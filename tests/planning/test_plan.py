@@ -477,7 +477,7 @@ def test_prediction_poses_depend_neither_on_constraints_nor_on_candidates():
         )
     )
     for made in (other, narrow):
-        assert_allclose(made.prediction.pose, free.prediction.pose, atol=1e-12)  # [m] per tolerance
+        assert_allclose(made.prediction.pose, free.prediction.pose, atol=1e-12)  # [m] per spread
     assert len(free.prediction) == PREDICTED
 
 
@@ -490,7 +490,7 @@ def test_prediction_poses_are_spread_over_a_long_list_of_poses(monkeypatch):
     free = select_free_parameters(robot)
     twists = observe_poses(free, lc.inverse(robot, listed[200:]).q).twists[0, :, 3:]
     # the instrument determines all nine parameters: nothing is projected out of the prediction
-    # [m] per tolerance
+    # [m] per spread
     found = [
         np.abs(made.prediction.displacements - one).max(axis=(1, 2)).min() < 1e-9 for one in twists
     ]

@@ -72,7 +72,7 @@ def test_derivatives_of_points_agree_with_the_forward_kinematics(robot) -> None:
             for s in (1.0, -1.0)
         ]
         by_hand = (ends[0] - ends[1]) / 2e-6 * planned.free.tolerance[place]
-        # [m per tolerance], central differences of 1e-3
+        # [m per spread], central differences of 1e-3
         assert_allclose(J[:, :, place], by_hand, atol=1e-11)
 
 

@@ -18,7 +18,7 @@ from tests.estimate.problems import UM, URAD, noise
 
 
 def calibrate_drawn(name: str) -> lc.CalibrationReport:
-    """Return the calibration of a machine drawn from its tolerances, against a limit of 20 um."""
+    """Return the calibration of a machine drawn from its spreads, against a limit of 20 um."""
     robot = lc.load_robot(name)
     machine = robot.with_values(sample_truth(robot, 1, 3)[0])
     instrument = Instrument((Sensor(Pose(), noise(*[20 * URAD] * 3, *[5 * UM] * 3)),))

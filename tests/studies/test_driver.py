@@ -507,7 +507,7 @@ def test_cells_whose_poses_are_given_up_are_left_out_and_named() -> None:
 
 
 def test_poses_depend_on_what_determines_them_only() -> None:
-    """Planned ones on tolerances and instrument too, none on what is done with measurements."""
+    """Planned ones on spreads and instrument too, none on what is done with measurements."""
     factors: dict[str, dict[str, Any]] = {
         "instruments": {"a": InstrumentLevel(), "b": InstrumentLevel(sigma_angle=1.0)},
         "noise": {"1": NoiseLevel(), "2": NoiseLevel(2.0)},

@@ -468,7 +468,7 @@ def simulate_accuracy(
 
     Parameters
     ----------
-    robot : its tolerances are those of the true errors, which each trial draws anew.
+    robot : its spreads are those of the true errors, which each trial draws anew.
     commanded : measured poses, (m, 4, 4) or (m, c). instrument : with what they are measured.
     poses : compared poses, (n, 4, 4) or (n, c), at the readings of the nominal robot.
     method : default least squares. trials : their number. seed : of all random streams.

@@ -248,7 +248,7 @@ def _fit(
     count: StepCounter,
     held_out: int = 0,
 ) -> tuple[Identification, ModelChoice | None, Change | None]:
-    """Return the fit from the tolerances, or with an earlier calibration as the prior; the choice
+    """Return the fit from the spreads, or with an earlier calibration as the prior; the choice
     of its parameters; and the comparison with the earlier calibration.
     """
     excluded = tuple(p for p in options.fit.excluded_poses if p in data.labels)

@@ -62,7 +62,7 @@ class CalibrationOptions:
     prior : the posterior of an earlier calibration of this machine; its knowledge is kept.
     compare_with : stored values, such as those of a firmware or published ones: by name [SI], or a
         robot that has them. They are tested jointly, see `loopcal.compare_with_values`.
-    free_limb : with `prior`: a limb that was repaired, which starts again from its tolerances.
+    free_limb : with `prior`: a limb that was repaired, which starts again from its spreads.
     frame : in which expected errors are stated: "fitted", "base", "relative", or the name of the
         frame of an instrument, see `loopcal.pose_uncertainty`.
     check_conventions : refuse data that fit far better in another unit, order, sign or column; see

@@ -103,7 +103,7 @@ DEPENDENT = {
     "residuals.correlated",
     "residuals.model-discrepancy",
 }
-# Finding that a calibration is not expected to improve on the tolerances.
+# Finding that a calibration is not expected to improve on the spreads.
 NO_GAIN = "model.no-expected-gain"
 ON_BASE = (*BASE_MOVED, "data.base-session-unused")  # findings on targets on the base
 # Factor on sigma from which an estimated noise is no property of an instrument.

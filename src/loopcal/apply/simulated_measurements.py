@@ -64,7 +64,7 @@ def simulate_measurements(
 
     robot : its values are those of the true machine, its nominal values those of the controller.
     poses : (n, c) controlled coordinates [m, rad], or how many to draw from the workspace.
-    draw_errors : draw the true machine from the tolerances instead.
+    draw_errors : draw the true machine from the spreads instead.
     reading_sigma : (a,) [SI] noise of the recorded readings; None as the robot states.
     labels : (n,) names of the poses, which are numbered without them.
     places : (n,) places of the poses such as `poses.csv:12`, for messages.
@@ -120,7 +120,7 @@ def fill_in_measurements(
 
 
 def _choose_truth(robot: Mechanism, draw_errors: bool, seed: int) -> Mechanism:
-    """Return a robot, or one whose values are drawn from its tolerances."""
+    """Return a robot, or one whose values are drawn from its spreads."""
     return robot.with_values(sample_truth(robot, 1, seed)[0]) if draw_errors else robot
 
 

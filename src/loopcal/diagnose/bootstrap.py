@@ -143,7 +143,7 @@ class RobustSpread(NamedTuple):
     independent errors. Each cluster has h rows, turned into the eigenvectors of its leverage H_gg.
     """
 
-    root: FloatArray  # (p, k) L in tolerances, for the k directions that the fit estimates
+    root: FloatArray  # (p, k) L in spreads, for the k directions that the fit estimates
     scores: FloatArray  # (G, k) h_g, the u_g in units of L
     # (G, k, h) the rows in units of L; without a prior the sum of their squares is k
     scaled_rows: FloatArray
@@ -338,7 +338,7 @@ def compute_block_errors(
 ) -> BlockErrors:
     """Return the errors of the rows of a fit, by independent blocks of poses.
 
-    shift : (p,) in tolerances, from the estimate to the truth of the resamples, at which the rows
+    shift : (p,) in spreads, from the estimate to the truth of the resamples, at which the rows
         have the residuals that the errors replace.
     """
     values = list_observed_values(linear, clusters)

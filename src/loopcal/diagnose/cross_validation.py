@@ -300,7 +300,7 @@ class Candidate:
     # converge
     validation: CrossValidation | None
     rank: int  # number of directions that all data determine at the values before calibration
-    condition: float  # number of the columns in tolerances; infinite without full rank
+    condition: float  # number of the columns in spreads; infinite without full rank
 
     FIELDS: ClassVar[tuple[Field, ...]] = (
         Field("name"),
@@ -475,7 +475,7 @@ def choose_model(
                 raise
             return None
 
-    columns: FloatArray = np.zeros((0, 0))  # of all free parameters, in tolerances
+    columns: FloatArray = np.zeros((0, 0))  # of all free parameters, in spreads
     free = select_free_parameters(robot)
     if len(free):
         kept = exclude_poses(fill_in_reading_sigma(robot, data), options.excluded_poses)
@@ -500,7 +500,7 @@ PER_DECADE = 4  # values of lam per factor of ten where no fit is repeated
 MOST_FITTED = 13
 # Range of lam in units of the largest squared singular value; a rule may choose more.
 LOWEST, HIGHEST = 1e-12, 10.0
-# Decades below lam = 1 (the tolerances as a prior) that the grid contains, as far as allowed.
+# Decades below lam = 1 (the spreads as a prior) that the grid contains, as far as allowed.
 FEWEST_DECADES = 4.0
 
 Scheme = Literal["leave-one-out", "folds"]
@@ -543,7 +543,7 @@ class RegularizationCurves(DrawnResult):
     Attributes
     ----------
     robot : its name. poses : that were used. parameters : free ones. scheme : what was left out at
-        a time. left_out : number of poses or folds. assumed : parameters without stated tolerance.
+        a time. left_out : number of poses or folds. assumed : parameters without stated spread.
     ridge, truncation : the curves. nominal : score of the given robot, with its standard error.
     """
 
@@ -620,7 +620,7 @@ def compute_regularization_curves(
     ]
     rules_k = [ChosenValue("GCV", float(TruncationGCV()(d)[0]))]
     # from hardly any effect on the weakest determined direction to hardly any use of the data, with
-    # 1 (the tolerances as a prior) and about what rules choose
+    # 1 (the spreads as a prior) and about what rules choose
     square, by_rules = d.singular_values[0] ** 2, [rule.value for rule in rules_lam]
     lowest = min(1e-2 * square[d.used[0]].min(), 10.0**-FEWEST_DECADES)
     low = np.log10(min(max(lowest, LOWEST * square[0]), *by_rules))

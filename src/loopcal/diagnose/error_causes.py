@@ -185,7 +185,7 @@ def _measure(linear: FitLinearization, rows: ResidualRows, cause: Cause) -> Find
 
 def find_print_scale(fit: Identification, data: Measurements) -> list[Finding]:
     """Return the scales at which boards are printed, where the parameters are farther from nominal
-    than their tolerances allow, and such scales explain it: another size of the board is another
+    than their spreads allow, and such scales explain it: another size of the board is another
     size of the machine.
     """
     changed, kinds = list[Observations](), dict[str, Image]()

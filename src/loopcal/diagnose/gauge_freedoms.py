@@ -50,7 +50,7 @@ SHARES = (1.0, 0.1, 0.01)
 NO_MOTION = 1e-8
 # Share of the motions by its single parameters up to which the motion of a combination is none, or
 # is that of a frame. Null directions of the last linearization, at the values after the last step,
-# leave 1e-10 or less in complete models; of tolerances of 0.1 mm this share is 0.1 nm.
+# leave 1e-10 or less in complete models; of spreads of 0.1 mm this share is 0.1 nm.
 SAME_MOTION = 1e-6
 
 
@@ -67,7 +67,7 @@ class GaugeFreedoms:
     still: int = 0  # number of independent combinations that change no pose
     changing: int = 0  # number of the others, which change poses relative to both frames
     # rotation [rad] and displacement of the tool [m] by the latter after the best fit of both
-    # frames: root mean square over poses, where every parameter deviates by its tolerance
+    # frames: root mean square over poses, where every parameter deviates by its spread
     effect: tuple[float, float] = (0.0, 0.0)
     where: str = "the workspace"  # or "poses about home", where the robot states no workspace
     # number of independent combinations that change no pose of the platform but move other bodies,
@@ -110,7 +110,7 @@ class WeighedMotions(NamedTuple):
     """Motions at sampled poses, rotations times the robot's size, see `weigh_motions`."""
 
     sample: SampledMotions
-    by_parameters: FloatArray  # (6 n, p) in tolerances
+    by_parameters: FloatArray  # (6 n, p) in spreads
     base: FloatArray  # (6 n, 6) by the base frame
     platform: FloatArray  # (6 n, 6) by the platform frame
     # (p,) length of the motion by each parameter, at least the median: the scale of combinations

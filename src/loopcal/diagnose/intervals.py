@@ -515,7 +515,7 @@ class PosteriorDensity:
     # decomposition, penalty: of rows divided by s; the penalty is that of a prior, or 0
     decomposition: Decomposition
     penalty: FloatArray
-    mean: FloatArray  # (p,) of the linear posterior, in tolerances
+    mean: FloatArray  # (p,) of the linear posterior, in spreads
     root: FloatArray  # (p, k) E
     setup_root: FloatArray  # (U, u) T
     scale: float  # s
@@ -528,7 +528,7 @@ class PosteriorDensity:
         return self.root.shape[1] + self.setup_root.shape[1]
 
     def parameters(self, coordinates: FloatArray) -> FloatArray:
-        """Return deviations (T, p) in tolerances at coordinates (T, k + u)."""
+        """Return deviations (T, p) in spreads at coordinates (T, k + u)."""
         return self.mean + coordinates[:, : self.root.shape[1]] @ self.root.T
 
     def setup(self, coordinates: FloatArray) -> FloatArray:
@@ -580,7 +580,7 @@ class PosteriorDensity:
             return -0.5 * (self.degrees + self.directions) * np.log(self.degrees + above)
 
     def _penalize(self, z: FloatArray) -> FloatArray:
-        """Return the penalty (T,) of the tolerances."""
+        """Return the penalty (T,) of the spreads."""
         return (self.penalty * self.decomposition.coordinates(z) ** 2).sum(axis=1)
 
 
@@ -718,7 +718,7 @@ def sample_posterior(
 ) -> PosteriorSample:
     """Draw parameters from the posterior of a fit by least squares or MAP.
 
-    The prior is that of the fit: the tolerances of MAP, the earlier calibration, and the priors of
+    The prior is that of the fit: the spreads of MAP, the earlier calibration, and the priors of
     setup parameters. Other parameters have a flat prior.
 
     Parameters

@@ -212,7 +212,7 @@ def find_slow_errors(
     residuals as these by noise, where errors of the place are known to cause them.
     """
     fit, tool = linear.fit, linear.fit.robot.tool[:3, 3]
-    # deviations from nominal show errors, too, but only as far as the tolerances are right
+    # deviations from nominal show errors, too, but only as far as the spreads are right
     if len(T) < FEWEST_POSES or fit.residual_test.degrees < FEWEST_DEGREES:
         return None
 

@@ -4,7 +4,7 @@ directions that the data determine.
 
 The values are true ones in a simulation, or a stored answer: published anchors, the numbers of a
 firmware, an earlier result. Fits of one machine may differ by millimeters along unobservable
-directions without any effect on the measurements. With the differences z in tolerances and an
+directions without any effect on the measurements. With the differences z in spreads and an
 orthonormal basis N of these directions, the comparable part is to first order
 e = (1 - N N') (z_estimate - z_given).
 
@@ -110,7 +110,7 @@ class ValueComparison(DeferredFields, TableResult):
     names : of the compared parameters.
     raw : estimate minus given value [SI].
     error : the same without the unobservable directions [SI].
-    tolerances : `error` in tolerances [1].
+    tolerances : `error` in spreads [1].
     dropped : the unobservable directions with a part of these parameters, as combinations.
     compared : number of directions that the data determine.
     degrees : number of directions that are tested: those of them that were estimated.

@@ -39,7 +39,7 @@ class FilteredStep(TrialBatch):
     """A step of some trials towards the filtered solution.
 
     deviation : (a, p) total deviation to which it leads. target : (a, p) that of the full step.
-    length, full_length : (a,) of this step and of the full one, in tolerances.
+    length, full_length : (a,) of this step and of the full one, in spreads.
     predicted : (a,) decrease of sum of squares plus penalty by the linear model.
     change : (a,) squared length of the full step measured in the whitened residuals and the
         penalty.
@@ -182,7 +182,7 @@ ACCEPTED_SHARE = 1e-4
 """Share of the predicted decrease that a step must bring."""
 
 ROUNDING_STEP, SMALL_STEP, SHORTEST_STEP = 1e-6, 1e-3, 1e-9
-"""Lengths in tolerances, relative to 1 + |z|. A full step below ROUNDING_STEP that brings no
+"""Lengths in spreads, relative to 1 + |z|. A full step below ROUNDING_STEP that brings no
 decrease has met rounding: the trial converged. So has one that was damped below SHORTEST_STEP
 without a decrease, if its full step is below SMALL_STEP."""
 
@@ -261,7 +261,7 @@ class StepControl:
         norm, and all further ones together would by at most a thousandth of it, as the ratio of the
         last two full steps lets expect. That step is still taken, without evaluating the rows
         again: the result is the solution of the last decomposition.
-    absolute : converged when the step is at most this long, in tolerances, relative to 1 + |z|.
+    absolute : converged when the step is at most this long, in spreads, relative to 1 + |z|.
     damping : of the first step, in units of the largest squared singular value; zero tries the full
         step.
 
@@ -292,7 +292,7 @@ class StepControl:
 class Descent:
     """Where the descent ended.
 
-    deviation : (t, p) total deviation z from nominal, in tolerances.
+    deviation : (t, p) total deviation z from nominal, in spreads.
     linear_model : of the rows next to `deviation`.
     cost : (t,) sum of squares of the whitened residuals.
     status : (t,) DescentStatus. iterations : (t,) steps taken.
@@ -362,7 +362,7 @@ def descend(
 
     A trial that fails is marked in `status` and never stops the others.
 
-    deviation : (t, p) where to begin, in tolerances. tolerance : relative rank tolerance.
+    deviation : (t, p) where to begin, in spreads. tolerance : relative rank tolerance.
     start : warm start; default: the first one of the problem.
     progress : receives each step with the sum of squares of the first trial.
     arrival : (t,), optional; by how much the step that led to `deviation` changed the whitened

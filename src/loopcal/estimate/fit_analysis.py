@@ -170,7 +170,7 @@ class FitAnalysis:
 
     @cached_property
     def stated_covariance(self) -> FloatArray:
-        """(p, p) covariance [SI] by noise and tolerances as stated."""
+        """(p, p) covariance [SI] by noise and spreads as stated."""
         scale = self.free.tolerance
         scaled = self.fit.decomposition.covariance(self.fit.penalty, *self.sources)[0]
         return scaled * scale[:, None] * scale
@@ -187,12 +187,12 @@ class FitAnalysis:
 
     @cached_property
     def prior_tests(self) -> tuple[PriorConflict | None, list[Finding]]:
-        """The stated tolerances against the data, and findings on them."""
+        """The stated spreads against the data, and findings on them."""
         return run_prior_tests(self.free, self.fit, self.method)
 
     @property
     def prior_conflict(self) -> PriorConflict | None:
-        """The stated tolerances against the data, where the method uses them."""
+        """The stated spreads against the data, where the method uses them."""
         return self.prior_tests[0]
 
     @cached_property
@@ -253,7 +253,7 @@ class FitAnalysis:
 
     @cached_property
     def stated_nuisance(self) -> NuisanceEstimate:
-        """Frames, targets, surfaces and offsets by noise and tolerances as stated."""
+        """Frames, targets, surfaces and offsets by noise and spreads as stated."""
         fit, setup = self.fit, self.weighted.nuisance
         if setup is None or (linearization := self._estimated[2]) is None:
             return NuisanceEstimate.empty(self.problem.parameters)
@@ -271,7 +271,7 @@ class FitAnalysis:
 
     @cached_property
     def completed(self) -> Identification:
-        """The result with the uncertainty of factors on tolerances, of stated setup parameters and
+        """The result with the uncertainty of factors on spreads, of stated setup parameters and
         of a loss.
         """
         stated = {name: self._later(f"stated_{name}") for name in COMPLETED}
@@ -306,7 +306,7 @@ class FitAnalysis:
 
     @cached_property
     def stated_findings(self) -> tuple[Finding, ...]:
-        """What the fit noticed, but what errors beyond noise and tolerances add."""
+        """What the fit noticed, but what errors beyond noise and spreads add."""
         fit, free, options, problem = self.fit, self.free, self.options, self.problem
         on_poses = list[Finding]()
         if (poses := self.poses) is not None:
@@ -342,7 +342,7 @@ class FitAnalysis:
 
 
 COMPLETED = ("covariance", "posterior", "nuisance", "findings")
-"""Fields of the result to which errors beyond noise and tolerances may add."""
+"""Fields of the result to which errors beyond noise and spreads may add."""
 
 
 def fit_setup_alone(

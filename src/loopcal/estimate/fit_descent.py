@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The descents of one fit: with or without a loss, from the closure or the kinematics, and again
-where the data ask for other tolerances than those of the prior.
+where the data ask for other spreads than those of the prior.
 
 A robust fit descends, weighs each block by its distance from the fit, and repeats. The weights are
 determined outside the descent and enter it as weights of the rows, so that every method,
@@ -259,7 +259,7 @@ def fit_with_tolerances(
     free: FreeParameters,
     progress: Progress = report_no_progress,
 ) -> tuple[Descent, FloatArray, Problem, FitOptions]:
-    """Descend, and again as long as the data ask for other components of the tolerances; return
+    """Descend, and again as long as the data ask for other components of the spreads; return
     also the options with these.
     """
     first = None
@@ -296,7 +296,7 @@ def fit_with_tolerances(
 def repeat_trials(
     problem: Problem, fit: Descent, options: FitOptions, free: FreeParameters
 ) -> Descent:
-    """Descend again in trials whose data ask for components of the tolerances, or determine some
+    """Descend again in trials whose data ask for components of the spreads, or determine some
     combination too weakly.
     """
     first, stated = fit, get_method(options)

@@ -180,7 +180,7 @@ def identify(
     data : the measurements. Where a reading has a sigma, given or stated by the robot, its pose is
         estimated as well (docs/theory/identification.md).
     method, loss : in place of those of `options`.
-    options : see `FitOptions`. By default stated tolerances are a prior, which is inflated where
+    options : see `FitOptions`. By default stated spreads are a prior, which is inflated where
         the data contradict it.
     progress : receives the steps of the iteration, with the sum of squares.
 
@@ -233,7 +233,7 @@ class IdentifiedTrials(TableResult):
     Attributes
     ----------
     values : (t, p of the robot). status : (t,) DescentStatus. iterations : (t,).
-    cost : (t,) whitened sum of squares. free_parameters : names, nominal values and tolerances.
+    cost : (t,) whitened sum of squares. free_parameters : names, nominal values and spreads.
     linear_models : of the last rows of consecutive trials. method : with what `adapt_method`
         entered.
     """
@@ -291,7 +291,7 @@ class IdentifiedTrials(TableResult):
 
     def standard_deviations(self, noise_variance: FloatArray | float = 1.0) -> FloatArray:
         """Return standard deviations (t, p free) [SI]; infinite where the data do not determine a
-        parameter. They do not contain the uncertainty of factors on the tolerances.
+        parameter. They do not contain the uncertainty of factors on the spreads.
         """
         scaled = self.decomposition.standard_deviations(
             self.penalty, noise_variance, self.prior_variance

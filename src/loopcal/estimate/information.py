@@ -2,7 +2,7 @@
 """Information that measurements hold of a robot at its present values, and the motions of the base
 and platform frames that they do not determine.
 
-Rows are [F | A | r]: nuisance parameters, the robot's free parameters in tolerances, the residual,
+Rows are [F | A | r]: nuisance parameters, the robot's free parameters in spreads, the residual,
 all whitened. Identifiability is read from the triangular factor of what is left of A once F is
 eliminated: the projection onto the complement of F, without forming it. See
 docs/theory/identification.md.
@@ -11,7 +11,7 @@ Let M (6, 12) be the twist of a pose by a motion g of the two frames, J the deri
 row by that twist, and F that by the setup parameters (frames, targets, surfaces, offsets). A motion
 g that solves `J M g + F b = 0` for all rows, with any b, changes no measured value. The solutions
 are the null space of what is left of J M once F is eliminated. A setup parameter with a stated
-tolerance adds its row; tolerances of the machine do not. See docs/theory/observability.md.
+spread adds its row; tolerances of the machine do not. See docs/theory/observability.md.
 """
 
 from __future__ import annotations
@@ -280,7 +280,7 @@ class ObservedPoses:
 
     @property
     def twists(self) -> FloatArray:
-        """(1, n, 6, p) by deviations in tolerances."""
+        """(1, n, 6, p) by deviations in spreads."""
         return self.linearized.by_parameters
 
     @property

@@ -9,7 +9,7 @@ total deviation, the estimate is z = sum_i f_i (c_i / s_i) v_i with the filter f
     TruncatedSVD(k)            0 up to k, infinite beyond it
     Ridge(lam)                 lam everywhere, or one lam per parameter (0: unpenalized)
     MAP()                      1: tolerances are standard deviations of a Gaussian prior
-    MAP(InflatedTolerances())  the default: the same, with inflated tolerances where the data
+    MAP(InflatedTolerances())  the default: the same, with inflated spreads where the data
                                contradict them
 
 The penalty acts on the total deviation from nominal in units of tolerance, never on the step, so
@@ -149,12 +149,12 @@ def _gcv(decomposition: Decomposition, penalty: FloatArray) -> FloatArray:
 
 # The methods.
 
-# Standard deviation, in assumed tolerances, of the prior that holds parameters without a stated
+# Standard deviation, in assumed spreads, of the prior that holds parameters without a stated
 # tolerance: half a percent of the robot's size, and 5 mrad. With 10, the curvature of the residuals
-# along weak combinations costs hundreds of steps; with 3, errors of five assumed tolerances would
+# along weak combinations costs hundreds of steps; with 3, errors of five assumed spreads would
 # be further than their standard deviation.
 HOLD = 5.0
-# Standard deviation of a combination, in assumed tolerances, beyond which no descent is tried
+# Standard deviation of a combination, in assumed spreads, beyond which no descent is tried
 # without that prior: a tenth of the robot's size, and 0.1 rad. Up to 27, most fits converge.
 WEAKEST = 100.0
 
@@ -163,7 +163,7 @@ class Method(Protocol):
     """The interface of a method, with what most methods do.
 
     `what`: a few words about it, for the help of the command line.
-    `has_prior`: whether it takes the stated tolerances as standard deviations of a prior.
+    `has_prior`: whether it takes the stated spreads as standard deviations of a prior.
     `is_biased`: whether its penalty is neither nothing nor such a prior.
     """
 
@@ -181,7 +181,7 @@ class Method(Protocol):
 
     def root(self, parameters: int) -> FloatArray | None:
         """Return L (p, p) of z = L u, where the method penalizes u; None where it penalizes the
-        deviations z, in tolerances.
+        deviations z, in spreads.
         """
         return None
 
@@ -189,7 +189,7 @@ class Method(Protocol):
         self, decomposition: Decomposition, limit: FloatArray | float = WEAKEST
     ) -> BoolArray:
         """Return the unpenalized directions (t, p) that the data determine, but with a standard
-        deviation above a limit, (t,) in tolerances, so that the method could hold them.
+        deviation above a limit, (t,) in spreads, so that the method could hold them.
         """
         return np.zeros_like(decomposition.used)
 
@@ -212,7 +212,7 @@ class Method(Protocol):
         return None
 
     def lacks_tolerances(self, free: FreeParameters) -> BoolArray:
-        """Return the parameters (p,) without whose stated tolerance that variance is not known."""
+        """Return the parameters (p,) without whose stated spread that variance is not known."""
         return np.zeros_like(free.assumed)
 
     def choice(self) -> tuple[str, float | tuple[float, ...] | Rule] | None:
@@ -224,7 +224,7 @@ class Method(Protocol):
 class LeastSquares(Method):
     """Least squares with rank detection.
 
-    Null directions get the smallest total deviation, in tolerances.
+    Null directions get the smallest total deviation, in spreads.
 
     Examples
     --------
@@ -289,7 +289,7 @@ class TruncatedSVD(Method):
 class Ridge(Method):
     """Tikhonov regularization: the sum of squares plus lam |z|^2.
 
-    z is the total deviation from nominal in tolerances.
+    z is the total deviation from nominal in spreads.
 
     Parameters
     ----------
@@ -381,10 +381,10 @@ class Ridge(Method):
     def prior_variance(
         self, decomposition: Decomposition, penalty: FloatArray, free: FreeParameters
     ) -> FloatArray | None:
-        """Return the variance of the true coordinates if the stated tolerances are right: 1 in
-        tolerances, whatever lam is.
+        """Return the variance of the true coordinates if the stated spreads are right: 1 in
+        spreads, whatever lam is.
 
-        It is NaN where a penalized parameter has no stated tolerance, where the tolerances are
+        It is NaN where a penalized parameter has no stated spread, where the spreads are
         correlated, or where different parameters have different lam: then the coordinates are
         correlated.
         """
@@ -398,7 +398,7 @@ class Ridge(Method):
         return np.full(penalty.shape, penalized.max(initial=0.0) if is_known else np.nan)
 
     def lacks_tolerances(self, free: FreeParameters) -> BoolArray:
-        """Return which parameters (p,) are penalized without a stated tolerance."""
+        """Return which parameters (p,) are penalized without a stated spread."""
         lam = 1.0 if callable(self.weights) else np.asarray(self.weights)
         return np.asarray(free.assumed & np.broadcast_to(lam > 0.0, free.assumed.shape))
 
@@ -409,24 +409,24 @@ class Ridge(Method):
 
 @dataclass(frozen=True)
 class MAP(Method):
-    """Maximum a posteriori: each tolerance is the standard deviation of a Gaussian prior.
+    """Maximum a posteriori: each expected spread is the standard deviation of a Gaussian prior.
 
     This is ridge with lam = 1. Directions that the data do not determine keep their prior. A
-    parameter without a stated tolerance is not penalized, unless it is held.
+    parameter without a stated spread is not penalized, unless it is held.
 
     Parameters
     ----------
-    inflation : factor on all tolerances, or a rule that chooses it, such as `InflatedTolerances()`.
+    inflation : factor on all spreads, or a rule that chooses it, such as `InflatedTolerances()`.
     free : (p,) parameters that are not penalized; `identify` enters those without a stated
-        tolerance.
+        spread.
     held : whether these have a prior nevertheless: HOLD times the tolerance that is assumed for
         them. `identify` enters it where the data determine some combination of them more weakly.
     noise : "given": the rows are divided by their true sigma. "estimated": by their true sigma up
         to one common factor. The factor is estimated from the part of the data that no parameters
         can explain, so that data and prior get their right weights.
     correlation : (p, p) of the deviations from nominal; `identify` enters the one of the common
-        errors that the robot states. None takes the tolerances as independent.
-    components : parts of the tolerances that are wider than stated; `identify` enters those that
+        errors that the robot states. None takes the spreads as independent.
+    components : parts of the spreads that are wider than stated; `identify` enters those that
         `InflatedTolerances` chose.
 
     Raises
@@ -461,8 +461,8 @@ class MAP(Method):
         return np.array(self.free) if any(self.free) and not self.held else None
 
     def covariance(self, parameters: int) -> FloatArray | None:
-        """Return the covariance (p, p) of the deviations in tolerances, without components; None
-        where they are independent, each with its tolerance.
+        """Return the covariance (p, p) of the deviations in spreads, without components; None
+        where they are independent, each with its spread.
         """
         if not self.held:
             return self.correlation
@@ -470,7 +470,7 @@ class MAP(Method):
         return covariance + np.diag(np.where(self.free, HOLD**2 - 1.0, 0.0))
 
     def root(self, parameters: int) -> FloatArray | None:
-        """Return the symmetric root of the covariance of the deviations, in tolerances."""
+        """Return the symmetric root of the covariance of the deviations, in spreads."""
         covariance = self.covariance(parameters)
         if covariance is None and not self.components:
             return None
@@ -501,7 +501,7 @@ class MAP(Method):
         return _penalize(decomposition, (sigma / inflation) ** 2)
 
     def read_inflation(self, decomposition: Decomposition, penalty: FloatArray) -> FloatArray:
-        """Return the factor (t,) on all tolerances that the penalty (t, p) of a fit contains; 1
+        """Return the factor (t,) on all spreads that the penalty (t, p) of a fit contains; 1
         where no direction is penalized.
         """
         is_penalized = np.isfinite(penalty) & (penalty > 0.0)

@@ -60,7 +60,7 @@ class CovariancePart(NamedTuple):
 
     @property
     def is_added(self) -> bool:
-        """Whether it is beside what noise and tolerances cause."""
+        """Whether it is beside what noise and spreads cause."""
         return self.source not in (NOISE, TOLERANCES)
 
 
@@ -344,7 +344,7 @@ class Posterior:
     discrepancy : slow errors of the poses that no geometry explains; None where none were found.
         Their effect on the parameters is one of the parts.
     shown_noise : the noise that the residuals alone show; None where it is not known.
-    information : what the data say without tolerances, to compare calibrations; None where it is
+    information : what the data say without spreads, to compare calibrations; None where it is
         not known.
     reading_sigma : (a,) standard deviations [SI] of the errors of readings at a pose that
         residuals show; None for those that the robot states.
@@ -499,7 +499,7 @@ def find_variance_sources(
     free: FreeParameters,
 ) -> VarianceSources:
     """Return what the variances of a fit are made of: noise as the test scales it, and the bias of
-    the penalty as the stated tolerances let it expect.
+    the penalty as the stated spreads let it expect.
     """
     prior = method.prior_variance(decomposition, penalty, free)
     is_known = test.intervals and (prior is None or not np.isnan(prior).any())

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The prior of a fit by MAP: which parts of the tolerances are wider than stated, the tests of the
-tolerances, and the uncertainty of the factors by which they are inflated.
+"""The prior of a fit by MAP: which parts of the spreads are wider than stated, the tests of the
+spreads, and the uncertainty of the factors by which they are inflated.
 
 A factor is estimated from the data that are fitted. Its error moves the estimate, by dz / d(log
 factor) times the error of its logarithm, and this is added to the covariance. It also changes the
-variances that the tolerances cause: with the standard deviation s of its logarithm these have the
+variances that the spreads cause: with the standard deviation s of its logarithm these have the
 relative standard deviation 2 s, which is that of 1 / (2 s^2) degrees of freedom.
 
-The stated tolerances are tested against the data. With the prior z ~ N(0, 1) and unit noise the
+The stated spreads are tested against the data. With the prior z ~ N(0, 1) and unit noise the
 projections c_i = u_i'b are independent, c_i ~ N(0, 1 + s_i^2), and the most probable deviation is z
 = V y, y_i = s_i c_i / (1 + s_i^2), of variance w_i = s_i^2 / (1 + s_i^2). Three tests ask whether
 the data are what such a prior predicts:
@@ -65,10 +65,10 @@ from loopcal.results.description import Field, fields
 from loopcal.typing import BoolArray, FloatArray
 
 # Odds of each kind of component against none, before the data: parts of one batch and common zeros
-# are frequent, the others less so. With these odds and right tolerances about 1 % of data sets get
+# are frequent, the others less so. With these odds and right spreads about 1 % of data sets get
 # a component.
 PRIOR_ODDS: Mapping[Kind, float] = {"shift": 0.3, "group": 0.1, "single": 0.1}
-# Components that are chosen at most; more say that the stated tolerances are no prior at all.
+# Components that are chosen at most; more say that the stated spreads are no prior at all.
 MOST_COMPONENTS = 8
 CYCLES = 4  # cycles in which the variances of the chosen components are optimized in turn
 WIDEST = 30.0  # factor on an estimated factor up to which its distribution is integrated
@@ -181,7 +181,7 @@ class ComponentSearch(NamedTuple):
     candidates: tuple[ToleranceComponent, ...]
 
     def choose(self) -> tuple[ToleranceComponent, ...]:
-        """Return the chosen components, of the better of two searches: from the stated tolerances,
+        """Return the chosen components, of the better of two searches: from the stated spreads,
         and from inflated ones.
         """
         searches = [self._search(is_inflated) for is_inflated in (False, True)]
@@ -230,7 +230,7 @@ class ComponentSearch(NamedTuple):
         return size[0, 0], square[0, 0]
 
     def _find_factor(self, chosen: Mapping[int, float]) -> float:
-        """Return the most probable factor on all tolerances with the chosen components."""
+        """Return the most probable factor on all spreads with the chosen components."""
         return float(find_most_probable_factor(self._decompose(chosen))[0])
 
     def _decompose(self, chosen: Mapping[int, float]) -> Decomposition:
@@ -261,13 +261,13 @@ def restate(
 
 
 POWER_QUANTILE = 0.8416212335729143  # normal quantile of the power 0.8
-WIDE = 5.0  # deviation in tolerances that a test should show; what it could not is reported
+WIDE = 5.0  # deviation in spreads that a test should show; what it could not is reported
 NAMED = 4  # largest number of parameters that are named
 
 
 def report_undetectable(free: FreeParameters, rows: Decomposition) -> list[Finding]:
     """Return a finding where deviations of WIDE tolerances would stay undetected by rows for the
-    stated tolerances, divided by their noise (t = 1).
+    stated spreads, divided by their noise (t = 1).
     """
     Q, count = predict(rows, np.ones(1)).information[0], int((~free.assumed).sum())
     if count == 0:
@@ -313,7 +313,7 @@ SAME_FACTOR = 0.05  # relative change of a component's factor below which the fi
 
 def choose_methods(free: FreeParameters, fit: Descent, method: Method) -> dict[int, MAP]:
     """Return the method with which a trial must be fitted again, by trial: those whose data ask for
-    other components of the tolerances than those of `method`.
+    other components of the spreads than those of `method`.
     """
     if not (isinstance(method, MAP) and isinstance(method.inflation, InflatedTolerances)):
         return {}
@@ -323,7 +323,7 @@ def choose_methods(free: FreeParameters, fit: Descent, method: Method) -> dict[i
         return {}
     asked, rows = converged, _divide(fit.decomposition, method)
     if not method.components:
-        # those in which any component has more evidence than none, besides the stated tolerances or
+        # those in which any component has more evidence than none, besides the stated spreads or
         # the inflated ones
         shown = rows.take(converged)
         factor = method.read_inflation(fit.decomposition, fit.penalty)[converged]
@@ -350,7 +350,7 @@ def run_prior_tests(
     free: FreeParameters, fit: Descent, method: Method
 ) -> tuple[PriorConflict | None, list[Finding]]:
     """Return the tests of the prior, where the method uses one, and their findings: those on the
-    tolerances, and which deviations from them the data could not show.
+    spreads, and which deviations from them the data could not show.
     """
     if not isinstance(method, MAP):
         return None, []
@@ -375,9 +375,9 @@ def run_prior_tests(
 
 
 def add_factor_uncertainty(result: Identification, fit: Descent) -> Identification:
-    """Return the result with the uncertainty of the factors that inflated its tolerances.
+    """Return the result with the uncertainty of the factors that inflated its spreads.
 
-    Nothing is added where the tolerances count as stated: below 1 no factor is used, and its
+    Nothing is added where the spreads count as stated: below 1 no factor is used, and its
     distribution has no error to one side.
     """
     method = result.method
@@ -400,7 +400,7 @@ def add_factor_uncertainty(result: Identification, fit: Descent) -> Identificati
 
 
 _FactorError = tuple[FloatArray, FloatArray, float]
-"""What an error of a factor does: the change (p,) of the estimate, in tolerances, by one standard
+"""What an error of a factor does: the change (p,) of the estimate, in spreads, by one standard
 deviation of the log factor; a root (p, k) of the covariance that the inflated deviations cause; and
 this standard deviation.
 """
@@ -409,13 +409,13 @@ this standard deviation.
 def _estimate_factor_error(
     result: Identification, fit: Descent, method: MAP, factor: float
 ) -> _FactorError:
-    """Return what the error of the factor on all tolerances does.
+    """Return what the error of the factor on all spreads does.
 
     In the coordinates y of the decomposition the estimate changes by 2 (1 - f_i) y_i; deviations
     of the variance tau_i^2 cause the error (1 - f_i) tau_i.
     """
     d, penalty = fit.decomposition, np.where(np.isfinite(fit.penalty), fit.penalty, 0.0)
-    rows = _divide(d, method)  # a factor is one component of all tolerances
+    rows = _divide(d, method)  # a factor is one component of all spreads
     s, c = (
         np.where(are_penalized(rows), x, 0.0)[0] for x in (rows.singular_values, rows.projections)
     )
@@ -444,7 +444,7 @@ def _estimate_component_errors(fit: Descent, method: MAP, factor: float) -> list
     data = predict(rows, np.array([factor]))
     Q, h = data.information[0], data.score[0]
     S = factor**2 * compute_prior_covariance(p, method.covariance(p), method.components)
-    # parameters without a tolerance follow the others
+    # parameters without a spread follow the others
     penalized = are_penalized(rows)
     errors = []
     for component in method.components:
@@ -471,7 +471,7 @@ def _divide(decomposition: Decomposition, method: MAP) -> Decomposition:
 
 # Probability that any of the tests rejects tolerances that are right.
 LEVEL = FALSE_ALARMS["tolerances"]
-FAR = 2.0  # deviation from nominal, in tolerances, above which a parameter is named
+FAR = 2.0  # deviation from nominal, in spreads, above which a parameter is named
 NAMED_FARTHEST = 3  # largest number of parameters that are named
 # Part of a parameter in a direction, relative to the largest, above which it is named.
 MAIN_PART = 0.3
@@ -495,15 +495,15 @@ class LargestDeviation:
 
 @dataclass(frozen=True)
 class PriorConflict:
-    """The stated tolerances against the data.
+    """The stated spreads against the data.
 
     statistic, degrees, p_value : Q, its degrees of freedom and the probability of a larger Q.
     direction, parameter : the tests of the worst direction and of the worst parameter.
     joint_p_value : probability that the most significant of the three tests is more significant.
-    inflation : factor by which all tolerances were inflated for the estimate.
+    inflation : factor by which all spreads were inflated for the estimate.
     components : parts of them that were inflated further.
     component_rows : kind, name, names of the parameters and factor of each.
-    farthest : names of the parameters farthest from nominal, and their deviations in tolerances.
+    farthest : names of the parameters farthest from nominal, and their deviations in spreads.
     """
 
     statistic: float
@@ -526,12 +526,12 @@ class PriorConflict:
 
     @property
     def conflict(self) -> bool:
-        """Whether the data contradict the tolerances."""
+        """Whether the data contradict the spreads."""
         return self.joint_p_value < LEVEL
 
     @property
     def finding(self) -> Finding:
-        """Whether the tolerances agree with the data, and what the method did."""
+        """Whether the spreads agree with the data, and what the method did."""
         if self.degrees < 0.5:
             return report_finding("prior.untested")
         inflated = self.inflation > 1.0 or bool(self.components)
@@ -558,7 +558,7 @@ class PriorConflict:
         )
 
     def report(self) -> list[Finding]:
-        """Return the finding where it says more than that the tolerances agree with the data."""
+        """Return the finding where it says more than that the spreads agree with the data."""
         return [self.finding] if self.conflict or self.components else []
 
 
@@ -569,15 +569,15 @@ def assess_prior_conflict(
     deviation: FloatArray,
     components: tuple[ToleranceComponent, ...] = (),
 ) -> PriorConflict:
-    """Test the prior of a fit (t = 1), from its decomposition for the stated tolerances, rows
-    divided by the noise that they show, and its deviation (p,) in tolerances. `inflation` and
+    """Test the prior of a fit (t = 1), from its decomposition for the stated spreads, rows
+    divided by the noise that they show, and its deviation (p,) in spreads. `inflation` and
     `components` are what the method inflated.
     """
     statistic, degrees = (float(value[0]) for value in compute_prior_statistic(decomposition))
     p_value, names = float(compute_chi_square_tail(degrees, statistic)), free.names
     square = np.where(are_penalized(decomposition), decomposition.singular_values**2, 0.0)[0]
     share, projections = square / (1.0 + square), decomposition.projections[0]
-    # the worst direction is named by its largest parts, in tolerances
+    # the worst direction is named by its largest parts, in spreads
     basis, is_testable = decomposition.directions[0], share > TESTABLE
     values = np.where(is_testable, np.abs(projections) / np.sqrt(1.0 + square), 0.0)
     part = np.where(free.assumed, 0.0, np.abs(basis[:, int(np.argmax(values))]))

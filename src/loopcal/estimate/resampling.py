@@ -34,7 +34,7 @@ class Resamples(TrialBatch):
 
     weight : (t, n) factors on the squares of each pose; None where the rows keep theirs.
     offset : of every kind (t, r, m), added to the whitened residuals; None without any.
-    center : (t, p) drawn center of the prior, in tolerances from nominal.
+    center : (t, p) drawn center of the prior, in spreads from nominal.
     prior : (t, r) errors of the rows of an earlier calibration; None without one.
     nuisance : (t, U) [SI] drawn means of the priors of nuisance parameters.
     equations : (t,) number of equations of each resample.
@@ -55,10 +55,10 @@ class Resamples(TrialBatch):
 class ResampleFits(TrialBatch):
     """Estimates of t resamples.
 
-    deviation : (t, p) in tolerances from nominal. linear : (t, p) the same to first order about the
+    deviation : (t, p) in spreads from nominal. linear : (t, p) the same to first order about the
         estimate of the fit.
     status : (t,) DescentStatus.
-    sd : (t, p) standard deviations in tolerances, for rows of unit variance.
+    sd : (t, p) standard deviations in spreads, for rows of unit variance.
     noise : (t,) variance of the rows that the residuals show; NaN without degrees of freedom.
     """
 
@@ -166,7 +166,7 @@ def _descend(
 
 
 def draw_centers(linear: FitLinearization, count: int, rng: np.random.Generator) -> FloatArray:
-    """Draw centers (count, p) of the prior of a fit by MAP, in tolerances from nominal."""
+    """Draw centers (count, p) of the prior of a fit by MAP, in spreads from nominal."""
     d, penalty = linear.decomposition, linear.prior_weight
     is_penalized = np.isfinite(penalty) & (penalty > 0.0)
     sd = np.where(is_penalized, 1.0 / np.sqrt(np.where(is_penalized, penalty, 1.0)), 0.0)

@@ -2,7 +2,7 @@
 """Test the residuals of a fit against the noise (chi-square), and estimate the noise.
 
 The test takes what no parameter can explain: the part of the rows outside the range of the
-parameters. No penalty and no prior enters it, so that wrong tolerances are not reported as noise.
+parameters. No penalty and no prior enters it, so that wrong spreads are not reported as noise.
 
 A stated sigma is taken as known to within a relative standard uncertainty u. That is knowledge of
 nu0 = 1 / (2 u^2) degrees of freedom (JCGM 100, equation G.3), to which the residuals add their own:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parts of the tolerances that can be wider than stated: what deviates together, a limb, a type of
+"""Parts of the spreads that can be wider than stated: what deviates together, a limb, a type of
 parameter, a single parameter.
 
-The deviations z from nominal, in tolerances, have the stated covariance C (1 for independent ones).
+The deviations z from nominal, in spreads, have the stated covariance C (1 for independent ones).
 A component adds its variance to some of them, so that the prior becomes
 
     z ~ N(0, factor^2 (C + sum_j variance_j E_j E_j'))
@@ -27,10 +27,10 @@ from loopcal.numerics.decomposition import Decomposition
 from loopcal.numerics.statistics import compute_chi_square_tail
 from loopcal.typing import BoolArray, FloatArray
 
-# The most probable factor on all tolerances, and how well the data determine it.
+# The most probable factor on all spreads, and how well the data determine it.
 
 LARGEST_FACTOR = 1e6
-"""Factor on tolerances up to which the most probable one is searched."""
+"""Factor on spreads up to which the most probable one is searched."""
 
 GRID = np.log(LARGEST_FACTOR) * np.linspace(0.0, 1.0, 20) ** 1.5
 """Logarithms of factors among which the minimum is bracketed."""
@@ -44,17 +44,17 @@ By = Literal["auto", "global", "groups", "heavy-tailed"]
 
 @dataclass(frozen=True)
 class InflatedTolerances:
-    """Inflate the tolerances by the factors that the data make most probable, at least 1.
+    """Inflate the expected spreads by the factors that the data make most probable, at least 1.
 
     The noise that the rows show (`estimate_excess_noise`) counts, so that a wrong sigma, wrong rows
-    or an incomplete model do not inflate the tolerances.
+    or an incomplete model do not inflate the spreads.
 
-    Called with a decomposition, the rule returns the factor on all tolerances. `identify` also
+    Called with a decomposition, the rule returns the factor on all spreads. `identify` also
     chooses the `loopcal.estimate.tolerance_components` that it allows.
 
     Parameters
     ----------
-    by : "global": one factor on all tolerances. "groups": also factors of their own for limbs and
+    by : "global": one factor on all spreads. "groups": also factors of their own for limbs and
         types of parameters, and shifts that parameters of one type share. "heavy-tailed": also
         single parameters. "auto", the default: all of these.
 
@@ -74,14 +74,14 @@ class InflatedTolerances:
             )
 
     def __call__(self, decomposition: Decomposition) -> FloatArray:
-        """Return the factor (t,) on all tolerances."""
+        """Return the factor (t,) on all spreads."""
         return find_most_probable_factor(
             decomposition.divided(estimate_excess_noise(decomposition))
         )
 
 
 def find_most_probable_factor(decomposition: Decomposition) -> FloatArray:
-    """Return the factor (t,) on all tolerances, at least 1, that makes the data most probable.
+    """Return the factor (t,) on all spreads, at least 1, that makes the data most probable.
 
     The smallest L on a grid is refined by Newton's method in the logarithm of factor^2:
 
@@ -146,7 +146,7 @@ WITHOUT_DIGITS = str.maketrans("", "", string.digits)
 
 @dataclass(frozen=True)
 class ToleranceComponent:
-    """A part of the tolerances that is wider than stated.
+    """A part of the spreads that is wider than stated.
 
     kind : "shift", "group" or "single". name : of the limb, type or parameter.
     places : positions of its free parameters. variance : that it adds, in squared tolerances.
@@ -159,7 +159,7 @@ class ToleranceComponent:
 
     @property
     def factor(self) -> float:
-        """Standard deviation of each of its parameters, in stated tolerances."""
+        """Standard deviation of each of its parameters, in stated spreads."""
         return float(np.sqrt(1.0 + self.variance))
 
     def to_row(self, names: Sequence[str]) -> dict[str, object]:
@@ -176,7 +176,7 @@ class ToleranceComponent:
 def compute_prior_covariance(
     parameters: int, correlation: FloatArray | None, components: Iterable[ToleranceComponent]
 ) -> FloatArray:
-    """Return the covariance (p, p) of the deviations in tolerances, without the common factor."""
+    """Return the covariance (p, p) of the deviations in spreads, without the common factor."""
     covariance = np.eye(parameters) if correlation is None else np.array(correlation)
     for component in components:
         columns = component.columns(parameters)
@@ -194,7 +194,7 @@ def list_components(free: FreeParameters, by: By) -> tuple[ToleranceComponent, .
     """Return the components that a setting allows, with variance 0.
 
     A limb and a type have two parameters or more, but not all; of equal ones the first counts.
-    Parameters without a stated tolerance belong to none.
+    Parameters without a stated spread belong to none.
     """
     kinds, stated, names = KINDS[by], np.flatnonzero(~free.assumed).tolist(), free.names
     result: list[ToleranceComponent] = []

@@ -72,7 +72,7 @@ class StatedValue:
 class NuisanceParameters:
     """All nuisance parameters of measurements."""
 
-    # the U parameters; a tolerance is a prior, a parameter without one is estimated from the data
+    # the U parameters; a spread is a prior, a parameter without one is estimated from the data
     # alone, a fixed one keeps its value
     table: ParameterTable
     indices: tuple[IntArray, ...]  # for each kind (r, u) the parameters that each row uses

@@ -207,13 +207,13 @@ class Trials:
 def sample_truth(
     robot: Mechanism, n_trials: int, seed: Seed, distribution: Distribution = "normal"
 ) -> FloatArray:
-    """Draw true parameter values from the tolerances: `nominal + tolerance * standard normal`.
+    """Draw true parameter values: `nominal + expected spread * standard normal`.
 
     A common error of several parameters is drawn once and added to each of them.
 
     Parameters
     ----------
-    robot : parameters that are fixed or have no tolerance stay nominal.
+    robot : parameters that are fixed or have no spread stay nominal.
     n_trials : trial i gets the same values for any number of trials.
     distribution : of the errors, "normal" or "uniform". The tolerances are their standard
         deviations in both: uniform errors lie within sqrt(3) of them.

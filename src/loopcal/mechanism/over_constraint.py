@@ -272,7 +272,7 @@ def is_over_constrained(robot: Mechanism) -> bool:
 
 def refuse_breaking_parameters(robot: Mechanism, drawn: bool = False) -> None:
     """Refuse free parameters that open the loops of an over-constrained robot; if errors are drawn,
-    those with a tolerance.
+    those with a spread.
     """
     names, finding = find_breaking_parameters(robot), find_over_constraint(robot)
     code = "mechanism.free-parameters-open-loops"

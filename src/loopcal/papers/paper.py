@@ -296,7 +296,7 @@ def adapt_content(content: Mapping[str, Any], robot: Mechanism, listed: int) -> 
 
     It gets as many poses of its own workspace in place of those `listed` in a file (three more than
     its parameters need by the count of equations, at least), and of rings that it does not reach,
-    errors by its tolerances in place of the errors of one machine, as many directions of
+    errors by its spreads in place of the errors of one machine, as many directions of
     truncated SVD as it has parameters, and no angles that it does not have.
     """
     changed = dict[str, Any]()

@@ -130,7 +130,7 @@ def choose_station(
     errors = np.full(len(usable), np.inf)
     for i, view in enumerate(usable):
         placed = Instrument((Sensor(view.camera, noise),), stated)
-        with suppress(EstimationError):  # a frame stays open without tolerances
+        with suppress(EstimationError):  # a frame stays open without spreads
             found = prepare_problem(robot, placed, options, candidates).predict_errors(every)
             errors[i] = np.inf if found is None else found.select(options.target)
         progress(i + 1, len(usable), "stations of the camera")

@@ -3,7 +3,7 @@
 
 The state of a session goes in and comes out: the rows measured so far, which of them are used, and
 the fit to these. It knows no terminal and no file. The fit is the maximum a posteriori estimate of
-setup and machine, so that a row is judged from the first pose on, as far as the tolerances allow.
+setup and machine, so that a row is judged from the first pose on, as far as the spreads allow.
 With the whitened rows [A | r] of the used visits and of all priors,
 
     step = -(A'A)^-1 A'r,   S = 1 + B (A'A)^-1 B',   d^2 = (q + B step)' S^-1 (q + B step)
@@ -193,7 +193,7 @@ class VisitFit:
     x: FloatArray  # (k,) setup [SI] and deviations of the machine [tolerances]
     unit: FloatArray  # (k,) see `solve_rows`; infinite for the machine
     rows: VisitRows
-    prior: FloatArray  # (., k + 1) whitened rows of the tolerances there
+    prior: FloatArray  # (., k + 1) whitened rows of the spreads there
     cost: float  # sum of squares at x
     solution: PartialSolution
 
@@ -205,7 +205,7 @@ class VisitFit:
     @property
     def scale(self) -> tuple[float, float]:
         """Noise in units of the stated one, and its degrees of freedom: 1 and infinity unless the
-        rows contradict the stated noise and tolerances.
+        rows contradict the stated noise and spreads.
         """
         cost, degrees = self.solution.cost, self.solution.degrees
         if degrees < FEWEST_DEGREES or compute_chi_square_tail(degrees, cost) >= SIGNIFICANCE:

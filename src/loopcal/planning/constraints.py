@@ -263,7 +263,7 @@ class PlanOptions(PlanSettings):
         "orientation".
     goal : error of `target` [m, rad], root mean square over the workspace, that the `share` of
         machines is to stay below; the plan then has the smallest number of poses that reaches it.
-    share : of machines with errors by the tolerances, whose error after the calibration a plan
+    share : of machines with errors by the spreads, whose error after the calibration a plan
         states: at least 0.7, so that the error is above the root mean square of all machines.
     hold_out : number of further poses for validation, drawn evenly; default one for four poses of
         the fit, and at least 5, which a verdict needs.

@@ -4,7 +4,7 @@
 A **group** is what is measured together: one pose, or several poses that one row compares. Its rows
 [F | A] have the nuisance parameters of the instruments (F, to be eliminated) before the unknowns of
 the machine (A). Directions of the machine that no candidate separates from the nuisance parameters
-are removed once, by a stated tolerance, for all designs alike. See docs/theory/planning.md.
+are removed once, by a stated spread, for all designs alike. See docs/theory/planning.md.
 """
 
 from __future__ import annotations
@@ -139,7 +139,7 @@ def factor_design(rows: FloatArray, prior: PriorInformation, space: ObservableSp
 
 @dataclass(frozen=True, eq=False)
 class Criterion:
-    """A scalar figure of the covariance C of the machine's unknowns, in tolerances.
+    """A scalar figure of the covariance C of the machine's unknowns, in spreads.
 
     name : "D", log determinant of the information, large where the volume of uncertainty is small;
         the best design does not depend on scaling. "I", mean variance of a prediction. "A", sum of
@@ -191,7 +191,7 @@ def evaluate_criterion(criterion: Criterion, factor: FloatArray, machine: FloatA
 class DesignProblem:
     """Groups to choose from, and what makes a choice good."""
 
-    rows: FloatArray  # (N, r, o + p) whitened and in tolerances; NaN where a group is not allowed
+    rows: FloatArray  # (N, r, o + p) whitened and in spreads; NaN where a group is not allowed
     criterion: Criterion
     prior: PriorInformation
     repeats: bool = False  # whether a group may be measured more than once

@@ -2,7 +2,7 @@
 """Pose groups that a plan chooses from: whitened rows of measurements not yet made, and the prior.
 
 A group is what is measured together: one pose, or the poses that one row of the instrument
-compares. Its rows are in tolerances of the machine's free parameters, behind the columns of the
+compares. Its rows are in spreads of the machine's free parameters, behind the columns of the
 nuisance parameters of the instrument, which all groups share (frames, targets, one surface).
 
 N poses make N (N - 1) / 2 pairs, too many to linearize where there are hundreds of poses. Then half
@@ -58,16 +58,16 @@ DENSE = 20
 class GroupRows:
     """Rows of N groups of poses."""
 
-    # (N, r, o + p) whitened, machine columns in tolerances; NaN where a pose is not reached
+    # (N, r, o + p) whitened, machine columns in spreads; NaN where a pose is not reached
     rows: FloatArray
     members: IntArray  # (N, k) indices of the poses of each group
     n_nuisance: int  # number o of nuisance parameters of the instrument
-    # (b, o + p) rows of their stated tolerances and of targets on the base, which do not depend
+    # (b, o + p) rows of their stated spreads and of targets on the base, which do not depend
     # on the choice of poses
     nuisance_prior: FloatArray
 
     def fold(self) -> tuple[FloatArray, int]:
-        """Return the factor (1, p + 1, p + 1) of all that could be measured, without tolerances of
+        """Return the factor (1, p + 1, p + 1) of all that could be measured, without spreads of
         the machine and the nuisance parameters eliminated, and the number of its rows.
         """
         width = self.rows.shape[2]
@@ -172,7 +172,7 @@ def linearize_groups(
 def combine_prior(
     free: FreeParameters, groups: GroupRows, measured: FloatArray | None = None
 ) -> PriorInformation:
-    """Return the information before the first new pose: stated tolerances of the robot and of the
+    """Return the information before the first new pose: stated spreads of the robot and of the
     instrument, and earlier measurements.
 
     measured : (p, p) factor of these, their nuisance parameters eliminated (the instrument was set
@@ -189,7 +189,7 @@ def combine_prior(
 
 def decompose_information(groups: GroupRows, measured: FloatArray | None = None) -> Decomposition:
     """Return the decomposition of all that could be measured and of earlier measurements, as for
-    `combine_prior`, without tolerances of the machine.
+    `combine_prior`, without spreads of the machine.
     """
     factor, count = groups.fold()
     if measured is not None:
@@ -351,7 +351,7 @@ def add_informative_groups(
 ) -> IntArray:
     """Return members (M, k) of at most `most` further groups of the most informative poses.
 
-    rows : (N, r, c) of groups, whitened and in tolerances; NaN where not allowed.
+    rows : (N, r, c) of groups, whitened and in spreads; NaN where not allowed.
     members : (N, k) their poses.
     """
     good, k, c = is_allowed(rows), members.shape[1], rows.shape[2]

@@ -79,7 +79,7 @@ from loopcal.units import Dimension
 # Poses of the workspace whose errors are predicted. They stand for all: with 200, plans of few
 # poses were better at these than elsewhere by up to 10 %.
 PREDICTED = 2000
-# Largest singular value, in information per tolerance, up to which an instrument determines
+# Largest singular value, in information per spread, up to which an instrument determines
 # nothing: the rest is rounding.
 NO_INFORMATION = 1e-6
 # Share of a pose's error up to which its position or orientation does not change at all: the rest
@@ -96,8 +96,8 @@ DIMENSIONS: dict[Target, Dimension] = {  # of the error of each target
 class Prediction:
     """Derivatives of the tool's pose at k poses of the workspace."""
 
-    rotations: FloatArray  # (k, 3, p) derivatives of its rotation [rad per tolerance]
-    displacements: FloatArray  # (k, 3, p) derivatives of its displacement [m per tolerance]
+    rotations: FloatArray  # (k, 3, p) derivatives of its rotation [rad per spread]
+    displacements: FloatArray  # (k, 3, p) derivatives of its displacement [m per spread]
     size: float  # makes rotations comparable with displacements [m]
     frame: ErrorFrame  # in which errors are stated
 
@@ -191,7 +191,7 @@ class PlanningProblem:
     candidates: Candidates  # poses that may be measured
     groups: GroupRows  # their rows
     prior: PriorInformation  # information before the first new pose
-    observable: Decomposition  # decomposition of all candidates together, without tolerances
+    observable: Decomposition  # decomposition of all candidates together, without spreads
     prediction: Prediction  # of the tool's pose over the workspace
     n_earlier_equations: int = 0  # of measurements made already, less their own nuisance parameters
     used_names: tuple[str, ...] = ()  # names of poses that were measured already

@@ -201,7 +201,7 @@ def build_parameter_table(
     """Return identified parameters: rows of `Identification.to_dict()["parameters"]`.
 
     is_complete : whether standard uncertainty, degrees of freedom, coverage factor, and the shift
-        in tolerances have columns, too.
+        in spreads have columns, too.
     """
     cells = []
     for row in rows:
@@ -238,7 +238,7 @@ def _format_degrees(degrees: float) -> str:
 
 
 def build_prior_table(conflict: PriorConflict) -> Table:
-    """Return the tests of the stated tolerances."""
+    """Return the tests of the stated spreads."""
     whole = ("all deviations", conflict.statistic, conflict.degrees, conflict.p_value, ())
     tests = (("worst direction", conflict.direction), ("worst parameter", conflict.parameter))
     rows = (

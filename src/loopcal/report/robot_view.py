@@ -131,7 +131,7 @@ def format_sum(weights: Mapping[str, float]) -> str:
 
 
 def _build_parameter_table(robot: Mechanism) -> Table:
-    """Return nominal and present values with tolerances."""
+    """Return nominal and present values with spreads."""
     units, rows = robot.shown_units, []
     for entry, value in zip(robot.parameters.entries, robot.values, strict=True):
         unit = units[entry.dimension]

@@ -404,7 +404,7 @@ INPUTS = FolderKind("trial", "trial.json", ("study", "cell", "trial"), (ROBOT, T
 @dataclass(frozen=True, eq=False)
 class Replay:
     """A calibrated trial: the report and the document of its run folder, and the folder of its
-    inputs. findings : that files or calibration differ from the cell in tolerances or method.
+    inputs. findings : that files or calibration differ from the cell in spreads or method.
     """
 
     report: CalibrationReport

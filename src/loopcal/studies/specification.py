@@ -148,7 +148,7 @@ class ErrorsLevel(Limited):
         lie within sqrt(3) of it.
     smallest : smallest size of a uniform error as a share of its largest (the spread stays its
         standard deviation).
-    tolerances : other tolerances by name of a parameter or by pattern, such as `leg*.length`.
+    tolerances : other expected spreads by name or pattern, such as `leg*.length`.
     deviations : equal true deviations from nominal in all trials, by name or pattern. Other
         parameters are nominal.
     """

@@ -32,7 +32,7 @@ TAPED = "line_lengths_when_at_origin"
 LENGTHS = [NAMES.index(f"{line}.length") for line in "ABCD"]
 ANCHORS = [i for i, name in enumerate(NAMES) if "anchor" in name]
 PRIOR = np.array([200.0, 200, 200, 5] * 4 + [3.0] + [0.3] * 4)
-"""Tolerances of the robot file with a tape of 5 mm [mm]."""
+"""Spreads of the robot file with a tape of 5 mm [mm]."""
 
 WRONG_LENGTHS = ["many", 1500, [1500] * 3, [1500] * 5, [1500, 1, 1, -2], [[1, 2, 3, 4]], ["1"] * 4]
 WRONG_LENGTHS += [[True, 1, 1, 1]]
@@ -283,7 +283,7 @@ def test_tape_in_another_unit_is_refused(tmp_path, factor) -> None:
 
 def test_estimate_is_that_of_least_squares_updated_with_the_tape(tmp_path) -> None:
     """The reference shares no code: dense least squares, then the conditional normal distribution
-    given the tolerances. The problem is not linear, so the two differ by a share of the sd.
+    given the spreads. The problem is not linear, so the two differ by a share of the sd.
     """
     samples = tape(5)
     fit = fit_samples(tmp_path, samples, LINE, sigma_tape=5e-3)

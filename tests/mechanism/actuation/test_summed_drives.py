@@ -145,7 +145,7 @@ limbs:
 
 
 def draw_errors(robot: Mechanism, seed: int) -> Mechanism:
-    """Return a robot with parameters off by one tolerance, drawn."""
+    """Return a robot with parameters off by one spread, drawn."""
     sd = np.array([p.tolerance or 0.0 for p in robot.parameters.entries])
     return robot.with_values(
         robot.values + sd * np.random.default_rng(seed).standard_normal(sd.size)
@@ -259,7 +259,7 @@ def test_weights_of_simulated_machines_are_as_accurate_as_stated(name: str) -> N
     assert fits.converged.all()
     is_weight = np.array([".weight." in p for p in robot.parameters.names])
     error = ((fits.values - truth) / fits.standard_deviations())[:, is_weight]
-    before = (robot.values - truth)[:, is_weight] / 1e-3  # in tolerances
+    before = (robot.values - truth)[:, is_weight] / 1e-3  # in spreads
     assert np.abs(fits.values - truth)[:, is_weight].max() < 0.3e-3 * np.abs(before).max()
     # squares of 200 draws have the mean 1 +- sqrt(2 / 200), 2.6 times that
     assert_allclose((error**2).mean(axis=0), 1.0, rtol=0, atol=2.6 * np.sqrt(2 / 200))

@@ -106,7 +106,7 @@ def test_planar_linkage_agrees_with_constructed_circles(
 
 
 def draw_machine(name: str, seed: int) -> tuple[Mechanism, dict[str, float]]:
-    """Return a shipped robot with errors as large as its tolerances, and its values by name."""
+    """Return a shipped robot with errors as large as its spreads, and its values by name."""
     nominal = load_cached_robot(name)
     draws = np.random.default_rng(seed).standard_normal(len(nominal.parameters))
     machine = nominal.with_values(nominal.values + draws * nominal.parameters.tolerance)

@@ -68,7 +68,7 @@ def draw_readings(machine: Mechanism, n: int, seed: int) -> Array:
 
 
 def draw_values(machine: Mechanism, seed: int) -> Array:
-    """Draw values (p,) of all parameters by their tolerances."""
+    """Draw values (p,) of all parameters by their spreads."""
     errors = np.random.default_rng(seed).standard_normal(len(machine.parameters))
     return machine.parameters.nominal + errors * machine.parameters.tolerance
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Compute the misfit of measurements to a robot that is free within its tolerances, and search for
+"""Compute the misfit of measurements to a robot that is free within its spreads, and search for
 the interpretation of them that explains them.
 
 Interpretations that differ in measured values share poses and sensitivities: they are the trials of
@@ -193,7 +193,7 @@ def exclude_far_rows(comparison: Comparison) -> Comparison:
     linearization, problem, data = comparison.linearization, comparison.problem, comparison.data
     if linearization is None or not np.isfinite(comparison.misfits).all():
         return comparison
-    # standard deviations (r, m) of whitened residuals by tolerances and noise; by noise alone for
+    # standard deviations (r, m) of whitened residuals by spreads and noise; by noise alone for
     # estimated poses, whose rows depend on each other
     expected = [np.ones(rows.whitener.shape[1:3]) for rows in problem.rows]
     first, p = np.arange(1), problem.parameters
@@ -268,7 +268,7 @@ def compute_quick_misfit(free: FreeParameters, data: Measurements) -> float:
 
 
 def compute_fitted_misfit(robot: Mechanism, data: Measurements) -> float:
-    """Return the misfit that a fit of redundant readings leaves, with tolerances as prior; infinite
+    """Return the misfit that a fit of redundant readings leaves, with spreads as prior; infinite
     where it does not converge, and for other robots. Such readings of a machine far from its file
     lead to no pose to compare.
     """
@@ -330,7 +330,7 @@ def _compute_misfit(linearization: Linearization, cost: FloatArray | None = None
 
 
 # Factor by which another interpretation must fit better before data are refused: true data of a
-# robot far beyond its tolerances fit twice as well in none of them.
+# robot far beyond its spreads fit twice as well in none of them.
 BETTER = 5.0
 
 
@@ -424,13 +424,13 @@ def _make_constant(old: FloatArray, new: FloatArray) -> FloatArray:
 # Steps by which the stated convention and the best other one are compared finally.
 REFINEMENT = 3
 LARGEST_STEP = 30.0  # tolerances that a parameter may leave its value in these steps
-# Factor by which the deviations of a robot far from nominal may exceed its tolerances, and the
+# Factor by which the deviations of a robot far from nominal may exceed its spreads, and the
 # steps of its fit.
 FAR_AWAY, FIT = 30.0, 12
 
 
 def refine_misfit(comparison: Comparison) -> tuple[float, FloatArray]:
-    """Return the misfit of the first interpretation after steps of a fit within the tolerances, or
+    """Return the misfit of the first interpretation after steps of a fit within the spreads, or
     to first order where that is smaller, and its nuisance parameters (U,) there.
     """
     if not comparison.is_finite:
@@ -603,7 +603,7 @@ def _list_known(kind: Kind) -> tuple[str, ...]:
 # robot far from nominal in data with a wrong unit.
 FAR_BETTER = 10.0
 # Misfit above which data that contradict stated setup parameters are refused. Below it, robots
-# far beyond their tolerances look the same, and it is a warning.
+# far beyond their spreads look the same, and it is a warning.
 GROSS = 100.0
 # Misfit up to which another interpretation is accepted if the robot reaches too few poses of the
 # data as written, which then have no misfit to compare.

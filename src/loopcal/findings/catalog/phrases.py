@@ -22,7 +22,7 @@ MOST_PARTS, MOST_WEAK_PARTS = 8, 4
 """Parameters of a combination that a sentence lists, and of one that is only hardly observable."""
 
 MINOR_PART = 0.05
-"""Part of a combination, in tolerances and relative to its largest, that a sentence only counts."""
+"""Part of a combination, in spreads and relative to its largest, that a sentence only counts."""
 
 SHOWN_REASONS = 3
 """Violated constraints that a sentence lists, most frequent first."""

@@ -229,7 +229,7 @@ class CommonErrorRecord:
 
     def resolve(self, parameters: Sequence[Parameter], place: int) -> CommonError:
         """Return the common error of the parameters that match; raises RecordError for unlike
-        parameters, a single one, or one without a tolerance of its own. place : in the list of the
+        parameters, a single one, or one without a spread of its own. place : in the list of the
         file.
         """
         at = ("common_errors", place)

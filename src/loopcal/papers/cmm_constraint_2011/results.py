@@ -3,7 +3,7 @@
 MAP, and errors at held-out poses; its tables, figures and verdicts.
 
 Robot and workspace are those of a robot file, by default of hexapod-nategh-agheli: the paper's
-Tables 1 and 2 are not in our text. A set of 1 mm is one tolerance of the robot file. Machines are
+Tables 1 and 2 are not in our text. A set of 1 mm is one spread of the robot file. Machines are
 drawn, held and calibrated by the cells of a study, see `studies/simulation/block.py`.
 """
 
@@ -118,7 +118,7 @@ def load_grid(case: StudyCase, seed: int, trials: int) -> GridStudy:
 def change_sizes(
     grid: GridStudy, errors: Mapping[str, float], noises: Mapping[str, float]
 ) -> GridStudy:
-    """Return a study with these errors [mm, a tolerance each] and noises [mm], by their names."""
+    """Return a study with these errors [mm, a spread each] and noises [mm], by their names."""
     error, held = (next(iter(levels.values())) for levels in (grid.errors, grid.instruments))
     return replace(
         grid,
@@ -160,12 +160,12 @@ class Study:
 
     @cached_property
     def observable(self) -> ObservableSpace:
-        """The directions of the free parameters, in tolerances, that plane and line determine."""
+        """The directions of the free parameters, in spreads, that plane and line determine."""
         return find_directions(self.planned, self.optimized.design)
 
     @cached_property
     def unit(self) -> tuple[float, str]:
-        """A tolerance of all parameters in mm, if they are lengths of one tolerance; else one."""
+        """A tolerance of all parameters in mm, if they are lengths of one spread; else one."""
         free = self.planned.free
         factor, symbols = free.display()
         is_one = set(symbols) == {"mm"} and np.ptp(free.tolerance) <= 1e-9 * free.tolerance[0]
@@ -258,7 +258,7 @@ def plan_points(grid: GridStudy, level: PosesLevel | None = None) -> Study:
 
 
 def find_directions(planned: PlaneLineGroups, design: FloatArray) -> ObservableSpace:
-    """Return the directions of the free parameters that groups determine without tolerances."""
+    """Return the directions of the free parameters that groups determine without spreads."""
     none = PriorInformation.none(len(planned.free))
     return find_observable_space(planned.linearize(design), none)
 
@@ -459,7 +459,7 @@ def find_frame_motions(
     study: Study, combinations: tuple[Combination, ...]
 ) -> list[tuple[str, FloatArray]]:
     """Return shifts along and rotations about the axes of the base and of the platform that lie in
-    the span of combinations, in words, and as directions (p,) in tolerances.
+    the span of combinations, in words, and as directions (p,) in spreads.
     """
     if not combinations:
         return []

@@ -589,7 +589,7 @@ def simulate_machines(
     is one of them, without it.
 
     The paper's methods take the setting that is best for the true machine. The library's methods
-    choose theirs from the data; MAP is given the true spread of the errors as its tolerances.
+    choose theirs from the data; MAP is given the true spread of the errors as its spreads.
     """
     whole = measure_machines(design, design.draw_true_values(trials, seed), seed)
     return tuple(run_settings(study, progress) for study in whole.both)

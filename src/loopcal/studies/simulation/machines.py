@@ -76,7 +76,7 @@ def build_robot_of(text: str) -> Mechanism:
 
 
 def change_tolerances(robot: Mechanism, errors: ErrorsLevel) -> Mechanism:
-    """Return a robot with the tolerances of a level, which the fit knows.
+    """Return a robot with the spreads of a level, which the fit knows.
 
     Raises DataError: a pattern that no parameter has, or a quantity of another dimension.
     """
@@ -93,7 +93,7 @@ def change_tolerances(robot: Mechanism, errors: ErrorsLevel) -> Mechanism:
 
 
 def draw_machines(robot: Mechanism, errors: ErrorsLevel, n_trials: int, seed: Seed) -> FloatArray:
-    """Return true parameter values (t, p) [SI]; `robot` has the tolerances of the level."""
+    """Return true parameter values (t, p) [SI]; `robot` has the spreads of the level."""
     table = robot.parameters
     if errors.deviations:
         values = np.array(table.nominal)
@@ -229,14 +229,14 @@ def describe_poses(content: Mapping[str, Any]) -> dict[str, Any]:
     """Return everything that determines the poses of a block, from its description.
 
     Drawn poses depend on the machine only. Planned ones also depend on what is measured, and on the
-    tolerances.
+    spreads.
     """
     given = convert(content, CellContent)
     description = {key: content[key] for key in ("robot", "poses", "seed")}
     description["scores"] = {"held_out": given.scores.held_out}
     if is_planned(given.poses):
         description |= {key: content[key] for key in ("instrument", "noise")}
-        stated = content["errors"]  # those settings that change the tolerances
+        stated = content["errors"]  # those settings that change the spreads
         names = ("tolerance_factor", "tolerances")
         description["errors"] = {name: stated[name] for name in names if name in stated}
     return description
@@ -254,7 +254,7 @@ def compute_poses(description: Mapping[str, Any]) -> CellPoses:
     if level.coordinates:
         measured = np.array(level.coordinates)
     elif level.is_on_surfaces:
-        # cells that differ in tolerances, noise or method have the same points
+        # cells that differ in spreads, noise or method have the same points
         groups = make_groups(robot.nominal, level)
         is_complete = level.count - 2 * level.groups >= len(groups.free)
         drawn = groups.draw(level.groups, stream)
@@ -398,7 +398,7 @@ def draw_motion(effects: EffectsLevel, trials: int, n: int, seed: Seed) -> Float
 class PreparedCell:
     """What the blocks of a cell compute with.
 
-    content : of its tasks. robot : nominal, with the tolerances of the cell.
+    content : of its tasks. robot : nominal, with the spreads of the cell.
     instrument : with its true noise. fit_options : of the cell.
     layout : points that are held on planes and lines; None for other poses.
     measured : (n, c) controlled coordinates of the measured poses.
