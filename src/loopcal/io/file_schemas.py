@@ -24,6 +24,7 @@ from loopcal.io.robot.robot_file import (
     list_keys,
     name_record,
 )
+from loopcal.measure.kinds import KINDS
 from loopcal.mechanism.families import FAMILIES
 from loopcal.units import Dimension, list_symbols
 
@@ -145,8 +146,6 @@ def build_settings_schema() -> Schema:
     """Return the schema of the settings of a measurement file, as a file of its name states them:
     those of all kinds, and for each kind its own.
     """
-    from loopcal.measure.kinds import KINDS
-
     make = SchemaMaker(units=False)
     common: dict[str, Schema] = {
         key: {"description": text, **(make.refer(SCALED[key]) if key in SCALED else {})}

@@ -220,9 +220,7 @@ def _list_compared_values(
     return values, np.array([named.get(c.name, usual) for c in kind.columns]), len(noise)
 
 
-def check_targets_move(
-    measurements: Measurements, T: FloatArray, size: float, *, allow: bool = False
-) -> None:
+def check_targets_move(measurements: Measurements, T: FloatArray, size: float) -> None:
     """Refuse a target whose values stay within the noise, although the robot moves it.
 
     A reflector on the floor, a frozen display or the column of another target give such values. Any
@@ -232,8 +230,6 @@ def check_targets_move(
 
     T : (n, 4, 4) T_base_platform of each pose, of the nominal robot. size : of the robot [m].
     """
-    if allow:
-        return
     for static in _find_static_targets(measurements):
         rows, kind = static.rows, static.rows.kind
         predicted = kind.measure(

@@ -421,7 +421,6 @@ def _refine_cluster(
     prior = np.diag(np.nan_to_num(weight, nan=0.0))
 
     def whiten(x: FloatArray, which: IntArray) -> tuple[FloatArray, FloatArray]:
-        del which
         rows = whiten_rows(
             evaluate_measurements(measurements, T[None], x, nuisance, joints), no_motion
         )

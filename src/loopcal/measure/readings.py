@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 from loopcal.engine import State
 from loopcal.errors import DataError, suggest_names
 from loopcal.measure.array_checks import broadcast_array, refuse_first
+from loopcal.measure.kinds.joints import ActuatorReadings
 from loopcal.measure.kinds.kind import Kind
 from loopcal.measure.observations import Observations
 from loopcal.mechanism.chains import locate_bodies, select_entries
@@ -25,7 +26,6 @@ from loopcal.typing import FloatArray, IntArray
 from loopcal.units import SMALLEST_SD, Dimension
 
 if TYPE_CHECKING:
-    from loopcal.measure.kinds.joints import ActuatorReadings
     from loopcal.measure.measurements import Measurements
 
 
@@ -113,8 +113,6 @@ def select_joint_values(
 
 def make_readings_kind(robot: Mechanism) -> ActuatorReadings:
     """Return the kind of a robot's readings, by which an uncertain one measures the true one."""
-    from loopcal.measure.kinds.joints import ActuatorReadings
-
     return ActuatorReadings({actuator.name: actuator.dimension for actuator in robot.actuators})
 
 

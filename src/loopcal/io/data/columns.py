@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from itertools import permutations
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -28,14 +28,12 @@ from loopcal.io.core.csv_table import (
     format_scaled,
     suggest_header,
 )
+from loopcal.measure.kinds.kind import Kind
 from loopcal.mechanism.assembly import FORCES
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import get_dimension
 from loopcal.typing import FloatArray, IntArray
 from loopcal.units import ABSOLUTE_ZERO, DISPLAY_UNITS, ROUNDING, SI_SYMBOLS, Dimension, find_unit
-
-if TYPE_CHECKING:
-    from loopcal.measure.kinds.kind import Kind
 
 LINK = ";"  # separates the names of poses that one row compares
 

@@ -26,7 +26,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, make_dataclass, replace
 from fnmatch import fnmatchcase
 from functools import cache, reduce
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Union, cast, get_args, get_origin
+from typing import Annotated, Any, Literal, Union, cast, get_args, get_origin
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,8 +47,15 @@ from loopcal.io.data.columns import (
     name_measured,
     refuse_unknown_columns,
 )
+from loopcal.measure.array_checks import drop_repeats
+from loopcal.measure.data_checks import check_kinds
+from loopcal.measure.kinds import KINDS
+from loopcal.measure.kinds.kind import BASE, Kind, name_shared_error
+from loopcal.measure.nuisance import StatedValue, collect_nuisance_parameters
+from loopcal.measure.observations import InstrumentRecord, NoisePart, Observations, StatedSize
 from loopcal.mechanism.families.placement import PoseRecord
 from loopcal.mechanism.model import Mechanism
+from loopcal.parameters import Parameter
 from loopcal.plain_text import quote
 from loopcal.typing import BoolArray, FloatArray, IntArray, find_array_type
 from loopcal.units import (
@@ -67,12 +74,6 @@ from loopcal.units import (
     Unit,
     find_sd_fault,
 )
-
-if TYPE_CHECKING:
-    from loopcal.measure.kinds.kind import Kind
-    from loopcal.measure.nuisance import StatedValue
-    from loopcal.measure.observations import InstrumentRecord, NoisePart, Observations, StatedSize
-    from loopcal.parameters import Parameter
 
 DIRECTIONS = ("along", "axis", "normal", "up")
 NOISE_UNITS = {
@@ -140,7 +141,7 @@ class Uncertainty:
         return sd / divisor, _state_size(text, distribution, divisor)
 
 
-StatedSd = tuple[float, "StatedSize"]  # standard deviation [SI], and how it is stated
+StatedSd = tuple[float, StatedSize]  # standard deviation [SI], and how it is stated
 
 LENGTHS = Annotated[list[Any], Dimension.LENGTH]
 NUMBERS = Annotated[list[Any], Dimension.RATIO]
@@ -155,8 +156,6 @@ def read_kind(file: YamlFile, node: Mapping[str, Any], location: Location) -> Ki
     FileError : no or an unknown kind, a setting that does not fit it, or a name of a target that
     no column can have.
     """
-    from loopcal.measure.kinds import KINDS
-
     name = node.get("kind")
     if name is None:
         example = "write '# kind: pose' at the top, or 'kind: pose' in a .yaml file of this name"
@@ -235,8 +234,6 @@ def match_names(
 
 def _state_size(text: Any, distribution: str = "normal", divisor: float = 1.0) -> StatedSize:
     """Return a number with its unit as a file states it."""
-    from loopcal.measure.observations import StatedSize
-
     match = NUMBER.match(text := str(text).strip())
     assert match is not None, "the reader has found the number"
     return StatedSize(float(match[0]), text[match.end() :].strip(), distribution, divisor)
@@ -369,7 +366,7 @@ RECORDS = {
 }
 
 
-Stated = tuple["StatedValue", YamlFile, Location]  # what is known, and where it is stated
+Stated = tuple[StatedValue, YamlFile, Location]  # what is known, and where it is stated
 
 
 def read_stated_values(
@@ -409,8 +406,6 @@ def _read_values_of_file(
     labels: tuple[str, ...],
 ) -> dict[str, Stated]:
     """Return name -> what one file states of a parameter."""
-    from loopcal.measure.nuisance import collect_nuisance_parameters
-
     stated = file.content.get(KEY, {})
     if not isinstance(stated, dict):
         sentence = f"{KEY!r} must name parameters, as {KEY}: {{tracker.x: {{sd: 1 mm}}}}"
@@ -500,8 +495,6 @@ def _read_one(
     file: YamlFile, node: Any, matching: Sequence[Parameter], place: Location
 ) -> list[StatedValue]:
     """Return the knowledge that one line states of each parameter that it denotes."""
-    from loopcal.measure.nuisance import StatedValue
-
     if node == FIXED:
         return [StatedValue(entry.name) for entry in matching]
     if not isinstance(node, dict):
@@ -525,8 +518,6 @@ def read_instrument(
     file: YamlFile, node: Mapping[str, Any], location: Location
 ) -> InstrumentRecord | None:
     """Return the stated instrument, None where there is none; FileError for wrong content."""
-    from loopcal.measure.observations import InstrumentRecord
-
     if (stated := node.get("instrument")) is None:
         return None
     if isinstance(stated, str):
@@ -607,9 +598,6 @@ def read_shared_errors(
     that an MPE states, and the priors, of 0 where a component has no such error. FileError : an
     unknown component or key, or no number.
     """
-    from loopcal.measure.kinds.kind import name_shared_error
-    from loopcal.measure.nuisance import StatedValue
-
     noise: dict[str, StatedSd] = {}
     priors: dict[str, StatedValue] = {}
     for key in (key for key in SHARED_ERRORS if key in node):
@@ -804,8 +792,6 @@ def read_observations(
 
     FileError : a cell that does not fit. DataError : noise that is not a covariance.
     """
-    from loopcal.measure.observations import Observations
-
     entry = _select_rows(table, entry, members)
     links, rows = entry.kind.poses_per_row, entry.rows
     measured, covariance, parts = _read_values(table, robot, entry)
@@ -843,9 +829,6 @@ def _read_entry(
     """Return the kind of some rows, from the settings at a place of the file, mounted on the
     robot's tool; refuse what it cannot measure.
     """
-    from loopcal.measure.data_checks import check_kinds
-    from loopcal.measure.kinds.kind import BASE
-
     kind = read_kind(file, node, place).with_tool(robot.tool)
     bodies = [stage.name for stage in robot.stages] or list(robot.assembly.bodies)
     if kind.of and not kind.is_of_base and kind.of not in bodies:
@@ -917,9 +900,6 @@ def _read_values(
     """Return measured values (r, c), the covariance (r, m, m) of their residuals [SI], and its
     parts where the file states them.
     """
-    from loopcal.measure.array_checks import drop_repeats
-    from loopcal.measure.observations import NoisePart
-
     kind, rows = entry.kind, entry.rows
     known = list_columns(robot, [kind])
     names = [name_measured(column.name, robot) for column in kind.columns]

@@ -19,7 +19,7 @@ import unicodedata
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -73,6 +73,7 @@ from loopcal.io.data.kind_settings import (
 )
 from loopcal.io.robot.robot_file import check_format, list_shipped_robots, load_robot
 from loopcal.measure.data_checks import check_duplicates, check_kinds, check_strokes, check_types
+from loopcal.measure.instrument import Gaussian, Instrument, Sensor
 from loopcal.measure.kinds.kind import Kind
 from loopcal.measure.measurements import Measurements, list_moving_targets
 from loopcal.measure.observations import Observations
@@ -84,9 +85,6 @@ from loopcal.mechanism.platform_coordinates import get_dimension
 from loopcal.mechanism.transmission import LOAD
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import EXAMPLES, SMALLEST_SD, find_sd_fault, find_unit
-
-if TYPE_CHECKING:
-    from loopcal.measure.instrument import Instrument
 
 # Fewest targets on the base that may determine the frame of an instrument. A single one shows no
 # rotation, and no other target would reveal its error.
@@ -695,8 +693,6 @@ def has_empty_readings(path: str | Path, robot: Mechanism) -> bool:
 
 def _build_instrument(table: Table, kinds: Sequence[KindRows]) -> Instrument:
     """Return the instrument with the noise that the settings of a table state."""
-    from loopcal.measure.instrument import Gaussian, Instrument, Sensor
-
     _check_base_targets([(table, kinds)])
     sensors = []
     for entry in kinds:

@@ -15,7 +15,7 @@ from functools import cached_property
 from importlib import resources
 from itertools import permutations
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import regex
 
@@ -39,12 +39,9 @@ from loopcal.io.data.columns import (
 )
 from loopcal.io.data.kind_settings import POSE_SETTINGS, SETTINGS, list_kind_settings, read_kind
 from loopcal.io.robot.robot_file import check_format
+from loopcal.measure.kinds.kind import Kind
 from loopcal.plain_text import quote
 from loopcal.units import UNITS, Dimension, find_unit, list_symbols, parse_quantity
-
-if TYPE_CHECKING:
-    from loopcal.measure.kinds.kind import Kind
-
 
 # Regular expressions of users, with a limit on their time.
 

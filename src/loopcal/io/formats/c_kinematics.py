@@ -129,7 +129,6 @@ def write(source: ExportSource, into: Path | None) -> Exported:
 
     DataError : the robot has more drives than freedoms, in limbs with passive joints.
     """
-    del into
     return Exported(fill_template(source.robot, ()), note_lost_terms(source.robot, FORMAT.name))
 
 

@@ -45,6 +45,8 @@ from loopcal.io.formats.program_format import (
     round_digits,
     round_length,
 )
+from loopcal.measure.kinds.position import Position
+from loopcal.measure.measurements import Measurements
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import LARGEST
 
@@ -143,7 +145,6 @@ def read_config(file: ValueFile, options: ImportOptions) -> Imported:
 
 def write(source: ExportSource, into: Path | None) -> Exported:
     """Return the anchors as M669 of RepRapFirmware; DataError for a robot without anchors."""
-    del into
     values, ending = source.values(), ".anchor.x"
     lines = [name.removesuffix(ending) for name in values if name.endswith(ending)]
     if not FREEDOMS <= len(lines) <= len(ANCHORS_OF_FIRMWARE):
@@ -166,9 +167,6 @@ def read(path: Path, options: ImportOptions) -> Imported:
         Not JSON, a key is missing or has other values, or the known poses do not determine an
         anchor and the file states none.
     """
-    from loopcal.measure.kinds.position import Position
-    from loopcal.measure.measurements import Measurements
-
     samples = parse(path)
     anchors = samples.anchors if samples.anchors is not None else estimate_anchors(samples, path)
     finding = report_finding(

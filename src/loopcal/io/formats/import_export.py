@@ -140,7 +140,6 @@ def _list_rows(source: ExportSource) -> list[dict[str, Any]]:
 
 def write_csv(source: ExportSource, into: Path | None) -> Exported:
     """Return the parameters as CSV."""
-    del into
     rows = _list_rows(source)
     text = format_columns({name: [row[name] for row in rows] for name in COLUMNS})
     return Exported(text, _report_intervals(source))
@@ -148,7 +147,6 @@ def write_csv(source: ExportSource, into: Path | None) -> Exported:
 
 def write_json(source: ExportSource, into: Path | None) -> Exported:
     """Return the parameters as one JSON document."""
-    del into
     rows = [
         {**row, "nominal": float(row["nominal"]), "value": float(row["value"])}
         | {"plus_minus": source.plus_minus.get(row["name"]), "free": row["free"] == "yes"}

@@ -59,6 +59,10 @@ from loopcal.io.formats.program_format import (
     shorten_numbers,
 )
 from loopcal.io.robot.robot_file import build_robot
+from loopcal.measure.kinds.distance import Separation
+from loopcal.measure.kinds.poses import Component
+from loopcal.measure.measurements import Measurements
+from loopcal.mechanism.solutions import forward
 
 STEPPERS = ("stepper_a", "stepper_b", "stepper_c")
 PROBED = "delta_calibrate"
@@ -171,11 +175,6 @@ def read(path: Path, options: ImportOptions) -> Imported:
 
     FileError : an option is missing or not a number, or the printer is not a delta.
     """
-    from loopcal.measure.kinds.distance import Separation
-    from loopcal.measure.kinds.poses import Component
-    from loopcal.measure.measurements import Measurements
-    from loopcal.mechanism.solutions import forward
-
     cfg, ends = read_config(path), ("_pos1", "_pos2")
     sorts = ("height", "manual_height")
     heights = [record for sort in sorts for record in _list_records(cfg, sort, ("", "_pos"))]

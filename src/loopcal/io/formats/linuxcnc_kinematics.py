@@ -37,7 +37,6 @@ def write(source: ExportSource, into: Path | None) -> Exported:
 
     DataError : the robot is commanded in a tilt, which LinuxCNC has no axes for.
     """
-    del into
     robot = source.robot
     others = [name for name in robot.controlled if name not in AXES]
     if others:

@@ -36,6 +36,9 @@ from loopcal.io.formats.program_format import (
     round_digits,
     round_length,
 )
+from loopcal.measure.kinds.joints import Closure
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.observations import Observations
 
 BELTS = ("bl", "br", "tr", "tl")  # belts in the order of CLBM, which is that of the readings
 # Coordinates by which the firmware defines its frame.
@@ -65,10 +68,6 @@ class MaslowConfig(ValueFile):
 
 def read(path: Path, options: ImportOptions) -> Imported:
     """Read the anchors, and the belt lengths of a log; FileError where one is missing."""
-    from loopcal.measure.kinds.joints import Closure
-    from loopcal.measure.measurements import Measurements
-    from loopcal.measure.observations import Observations
-
     anchors = MaslowConfig.load(path).list_anchors()
     sigma = options.choose_noise("line") / MM
     corners = np.array(list(anchors.values()))

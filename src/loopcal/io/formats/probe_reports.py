@@ -15,7 +15,7 @@ import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -25,10 +25,10 @@ from loopcal.io.core.text_file import read_text
 from loopcal.io.core.yaml_file import parse_yaml
 from loopcal.io.formats.program_format import MM, ImportOptions, parse_number
 from loopcal.io.robot.robot_file import build_robot
+from loopcal.measure.kinds.poses import Component
+from loopcal.measure.measurements import Measurements
+from loopcal.mechanism.solutions import inverse
 from loopcal.typing import FloatArray
-
-if TYPE_CHECKING:
-    from loopcal.measure.measurements import Measurements
 
 FEWEST = 7  # points below which six numbers of a firmware cannot be determined and tested
 NUMBER = r"([-+]?\d+(?:\.\d*)?|[-+]?\.\d+)"
@@ -88,10 +88,6 @@ def import_probes(
 
     FileError : no heights, a report that cannot be used, or a point out of reach.
     """
-    from loopcal.measure.kinds.poses import Component
-    from loopcal.measure.measurements import Measurements
-    from loopcal.mechanism.solutions import inverse
-
     first = options.probes[0]
     probe = _read_probe((path, *options.probes), firmware)
     points, noted = read_reports(options.probes, firmware, probe)

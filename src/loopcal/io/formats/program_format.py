@@ -24,15 +24,15 @@ from loopcal.io.core.csv_table import parse_finite
 from loopcal.io.core.limits import format_comment
 from loopcal.io.core.text_file import read_bytes, read_text
 from loopcal.io.core.yaml_file import format_yaml
+from loopcal.measure.kinds.kind import Kind
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.observations import Observations
 from loopcal.mechanism.model import Mechanism
 from loopcal.plain_text import quote
 from loopcal.units import LARGEST
 
 if TYPE_CHECKING:
     from loopcal.apply.compensation import CorrectionTable, What
-    from loopcal.measure.kinds.kind import Kind
-    from loopcal.measure.measurements import Measurements
-    from loopcal.measure.observations import Observations
 
 MM = 1e-3
 # Standard deviations [m] that are assumed where nobody states them: of a probed height, of a
@@ -82,8 +82,6 @@ class ImportOptions:
         """Return values measured in the platform frame, with the noise of the last of `what`; it is
         marked as assumed where any of them is.
         """
-        from loopcal.measure.observations import Observations
-
         sigma = self.choose_noise(what[-1])
         observed = Observations.from_sigma(kind.with_tool(np.eye(4)), rows, measured, sigma)
         return replace(observed, is_noise_assumed=self.is_noise_assumed(*what))

@@ -277,7 +277,6 @@ class Kind(ABC):
 
     def hide_unseen(self, T: FloatArray, columns: FloatArray, values: FloatArray) -> FloatArray:
         """Return measured columns (t, r, c) with NaN where an instrument sees nothing."""
-        del T, values
         return columns
 
     @property
@@ -311,7 +310,6 @@ class Kind(ABC):
         """Return the kind for a robot with this tool (4, 4); the same object where the tool does
         not matter or is stated.
         """
-        del T_platform_tool
         return self
 
     @property
@@ -531,7 +529,6 @@ class Kind(ABC):
         """Return candidates (k, u) for the nuisance parameters that rows share, from poses T
         (r, 4, 4) and columns (r, c); `loopcal.measure.initial_values` refines and compares them.
         """
-        del T, measured
         return self.nominal_values[None]
 
     def guess_sets(
@@ -556,7 +553,6 @@ class Kind(ABC):
 
     def find_invalid_rows(self, measured: FloatArray) -> InvalidRows:
         """Return rows of columns (r, c) with impossible values: (index, end of a sentence)."""
-        del measured
         return ()
 
     @property
@@ -576,7 +572,6 @@ class Kind(ABC):
         differences of the platform's poses from these, see `engine.compare_poses`; None where they
         are not.
         """
-        del measured
         return None
 
     def evaluate(

@@ -111,7 +111,6 @@ class ToolKind(Kind):
 
     def guess_values(self, T: FloatArray, measured: FloatArray) -> FloatArray:
         """Return 24 evenly spread orientations of the frame."""
-        del T, measured
         return self.spread_frames()
 
     @property

@@ -17,7 +17,13 @@ import numpy as np
 
 from loopcal import geometry
 from loopcal.errors import DataError
-from loopcal.measure.array_checks import check_array, check_names, check_pose, set_fields
+from loopcal.measure.array_checks import (
+    check_array,
+    check_names,
+    check_point,
+    check_pose,
+    set_fields,
+)
 from loopcal.measure.kinds import setup_parameters as setup
 from loopcal.measure.kinds.kind import (
     POSITION_COLUMNS,
@@ -229,16 +235,11 @@ class Position(TargetKind):
         counts; default: its origin.
     """
 
-    station: FloatArray | None = None
+    station: FloatArray | None = checked(check_point, "the station")
 
     name: ClassVar[str] = "position"
     length_error: ClassVar[str] = "position"
     per_target: ClassVar[tuple[Column, ...]] = POSITION_COLUMNS
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.station is not None:
-            set_fields(self, station=check_array(self.station, "the station", (3,)))
 
     @classmethod
     def examples(cls) -> tuple[Self, ...]:
