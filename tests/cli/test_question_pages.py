@@ -145,9 +145,9 @@ def test_page_of_methods_is_true_of_the_evidence(root) -> None:
             assert truncated > find("default", errors, effects, "position", "median")[0]
             assert find("truncated SVD", errors, effects, "covered_position", "mean")[0] > 0.99
     default = [find("default", e, "none", "position", "median")[0] for e in (stated, worse)]
-    prior = find("tolerances as stated", worse, "none", "position", "median")[0]
+    prior = find("spreads as given", worse, "none", "position", "median")[0]
     assert 1.4 < prior / default[1] < 1.6
-    assert 0.6 < find("tolerances as stated", worse, "none", "covered_position", "mean")[0] < 0.73
+    assert 0.6 < find("spreads as given", worse, "none", "covered_position", "mean")[0] < 0.73
     plain = find("least squares", stated, "none", "position", "median")[0]
     assert 1.4 < plain / default[0] < 1.6
     narrow = find("ridge", worse, outliers, "covered_position", "mean")
@@ -157,7 +157,7 @@ def test_page_of_methods_is_true_of_the_evidence(root) -> None:
     for method, errors, sentence in (
         ("default", stated, "U (95 %) covers {} % of the errors"),
         ("default", worse, "and {} % if machines are four times as bad"),
-        ("tolerances as stated", worse, "errors are larger by half and U covers {} %"),
+        ("spreads as given", worse, "errors are larger by half and U covers {} %"),
     ):
         covered = 100 * find(method, errors, "none", "covered_position", "mean")[0]
         assert sentence.format(f"{covered:.0f}") in read_page(root, "methods")

@@ -312,7 +312,7 @@ CHOICES = {
 
 METHODS = (
     "default",
-    "tolerances as stated",
+    "spreads as given",
     "default with Huber",
     "least squares",
     "ridge",

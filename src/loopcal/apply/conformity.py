@@ -3,7 +3,7 @@
 
 What was measured is the true error and the noise of the measurement. A decision from the measured
 value alone accepts errors above the limit, or rejects errors below it, with an unknown risk. The
-probability of conformity is the one that the true error keeps the limit, given the measurement and
+conformance probability is the one that the true error keeps the limit, given the measurement and
 its noise (JCGM 106:2012, section 7). The decision rule is that of ISO 14253-1: conformity needs at
 least this probability, 95 % by default, and so does nonconformity. In between the measurement
 decides nothing. In terms of the estimate, both are guarded: the acceptance limit is the limit less
@@ -304,7 +304,7 @@ def report_conformity(
     units: Mapping[str, Unit],
     poses: Sequence[str],
 ) -> list[Finding]:
-    """Return the one statement on each limit: by the probability of conformity or, where nobody
+    """Return the one statement on each limit: by the conformance probability or, where nobody
     stated the noise, by the measured error, noise included.
 
     poses : (r,) labels of the rows.
