@@ -45,13 +45,12 @@ def linearize(
         unknown = group.unknown_joints(free)
         with np.errstate(all="ignore"):
             chain = Chain(group, place_links(group, e).select(trial), bodies, theta, program.size)
-            columns = chain.stack(
-                *(chain.rows_of_joint(j) for j in unknown),
+            rows = chain.reduce(
+                unknown,
                 *(chain.rows_of_twist(node, f) for node, f in program.unknown_twists),
-                *(chain.rows_of_slot(s) for s in group.slots),
-                *(chain.rows_of_joint(j) for j in range(chain.last)),
+                *map(chain.rows_of_slot, group.slots),
+                *map(chain.rows_of_joint, range(chain.last)),
             )
-            rows = triangularize(columns, len(unknown)) if unknown else columns
         rows = rows.transpose(3, 2, 0, 1).reshape(t, n, len(group.limbs), *rows.shape[:2])
         u = len(unknown)
         cuts = np.cumsum([u, len(program.unknown_twists), len(group.slots)])
@@ -284,14 +283,15 @@ class Chain:
         rows = self.rows_of_shift(direction) if axis >= 3 else self.rows_of_turn(direction, arm)
         return rows if j == self.last else -rows
 
-    def stack(self, *columns: FloatArray, right: int = 0) -> FloatArray:
-        """Return columns side by side, (r, c, k, N), and room for more on the right."""
+    def reduce(self, unknown: Sequence[int], *columns: FloatArray) -> FloatArray:
+        """Return rows (r, c, k, N) against unknown joints, which eliminate them, then columns."""
+        columns = (*map(self.rows_of_joint, unknown), *columns)
         k, N = self.gap.shape[1:]
         # limb by limb in memory: the rows of all limbs are one matrix without a copy
-        out = np.empty((k, len(self.group.rows), len(columns) + right, N)).transpose(1, 2, 0, 3)
+        out = np.empty((k, len(self.group.rows), len(columns), N)).transpose(1, 2, 0, 3)
         for c, column in enumerate(columns):
             out[:, c] = column
-        return out
+        return triangularize(out, len(unknown))
 
 
 def _select_bodies(bodies: FloatArray, numbers: Sequence[int]) -> FloatArray:

@@ -17,13 +17,12 @@ SMALLEST = 1e-300
 PART = 8  # rows of a part of many rows that are folded, over their columns
 
 
-def triangularize(matrix: FloatArray, columns: int, *, overwrite: bool = False) -> FloatArray:
-    """Return Q' matrix (r, c, batch), upper triangular in its first columns, by reflections.
+def triangularize(m: FloatArray, columns: int) -> FloatArray:
+    """Return Q'm (r, c, batch), upper triangular in its first columns, in the memory of m.
 
     Each reflects a column x to alpha e0 by v = x - alpha e0, and another one y to
-    y + v (x'y - alpha y0) / (alpha v0). With `overwrite` the result takes the matrix's memory.
+    y + v (x'y - alpha y0) / (alpha v0).
     """
-    m = matrix if overwrite else matrix.copy()
     for j in range(count_reflections(len(m), columns)):
         v, right = m[j:, j], m[j:, j + 1 :]
         products = np.einsum("i...,ij...->j...", v, m[j:, j:])

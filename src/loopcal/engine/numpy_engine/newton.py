@@ -16,7 +16,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from loopcal.engine.numpy_engine.certificate import has_driven_rods
 from loopcal.engine.numpy_engine.closure import (
     Chain,
     PlacedLinks,
@@ -30,11 +29,7 @@ from loopcal.engine.numpy_engine.closure import (
     split_bodies,
     split_joints,
 )
-from loopcal.engine.numpy_engine.householder import (
-    back_substitute,
-    count_reflections,
-    triangularize,
-)
+from loopcal.engine.numpy_engine.householder import back_substitute, count_reflections
 from loopcal.engine.numpy_engine.nodes import (
     Front,
     factor_nodes,
@@ -204,9 +199,6 @@ def solve(
     unknown = [g.unknown_joints(free) for g in program.groups]
     redundant = program.sigma is not None and not free
     begin = list_coordinates(program, q, start, (t, n))
-    has_one_start = len(e) == 1 and start.T.shape[:2] == (1, 1)
-    together = has_one_start and has_driven_rods(program) and not free
-    together = together and task is None and sums is None
     goals = None if goal is None else goal.T.reshape(t * n, 4, 4)[:, :3].transpose(1, 2, 0)
     chunks = []
     for part in divide_rows(t * n) or [slice(0)]:
@@ -218,7 +210,7 @@ def solve(
             own = Sums(weights, sums.values[part])
         equations = _Equations(program, unknown, redundant, placed, task, rows, own)
         goal_rows = None if goals is None else goals[..., part]
-        chunks.append(_iterate(equations, begin[:, part], max_iterations, goal_rows, together))
+        chunks.append(_iterate(equations, begin[:, part], max_iterations, goal_rows))
     whole = Solved(*(np.concatenate(arrays, axis=-1) for arrays in zip(*chunks, strict=True)))
     return _pack(program, whole, (t, n))
 
@@ -250,16 +242,9 @@ def follow_by(
 
 
 def _iterate(
-    equations: _Equations,
-    coordinates: FloatArray,
-    max_iterations: int,
-    goal: FloatArray | None,
-    together: bool,
+    equations: _Equations, coordinates: FloatArray, max_iterations: int, goal: FloatArray | None
 ) -> Solved:
-    """Iterate rows until each has converged, is near its goal (3, 4, N), or failed.
-
-    together : whether all rows begin with one Jacobian.
-    """
+    """Iterate rows until each has converged, is near its goal (3, 4, N), or failed."""
     program, N = equations.program, coordinates.shape[1]
     size = program.size
     closed_gap, short_step = RESIDUAL * size, STEP * size
@@ -270,7 +255,7 @@ def _iterate(
     share, applied, at_rounding = np.ones(N), np.full(N, np.inf), np.zeros(N)
     alive = np.arange(N)
     with np.errstate(all="ignore"):
-        now = equations.evaluate(coordinates, together)
+        now = equations.evaluate(coordinates)
         # some coordinates are in no equation
         now = now._replace(pivot=now.pivot * np.isfinite(np.add.reduce(coordinates[:12], axis=0)))
         for step in range(max_iterations):
@@ -361,16 +346,11 @@ class _Equations:
                 q[group.actuator[j]] = theta[j]
         return add_terms(self.sums.weights.T * q[:, None]) - self.sums.values.T
 
-    def evaluate(self, coordinates: FloatArray, together: bool = False) -> Iterate:
-        """Return the Newton step at these coordinates and its measures.
-
-        together : all rows have the Jacobian of the first one.
-        """
+    def evaluate(self, coordinates: FloatArray) -> Iterate:
+        """Return the Newton step at these coordinates and its measures."""
         program, N = self.program, coordinates.shape[1]
         bodies, limbs = split_bodies(program, coordinates), split_joints(program, coordinates)
-        if together:
-            bodies = bodies[..., :1]
-        eliminated = [self._eliminate(i, bodies, theta, together) for i, theta in enumerate(limbs)]
+        eliminated = [self._eliminate(i, bodies, theta) for i, theta in enumerate(limbs)]
         tops, lows, signs, pivots = map(list, zip(*eliminated, strict=True))
         fronts = [front for of_group in lows for front in of_group]
         if self.task is not None:
@@ -383,17 +363,16 @@ class _Equations:
             gap = self.compare_sums(limbs)[:, None]
             rows = np.concatenate([np.broadcast_to(weights, (*weights.shape[:2], N)), gap], axis=1)
             fronts.append(Front((len(program.nodes),), rows))
-        sides = N if together else 1
         inner = np.zeros(N)
         for top in tops:
             if len(top):
                 inner += add_terms(add_terms(top[:, -1] ** 2))
-        right = np.concatenate([front.rows[:, -sides:] for front in fronts])
-        norm = np.sqrt(inner + add_terms(right**2).reshape(N))
-        factored, sign = factor_nodes(program, fronts, sides, self.sums is not None)
-        removable = np.concatenate([front.rows[:, -sides:] for front in factored])
-        reducible = np.sqrt(inner + add_terms(removable**2).reshape(N))
-        y = {node: part.reshape(-1, N) for node, part in solve_nodes(program, factored, sides)}
+        right = np.concatenate([front.rows[:, -1] for front in fronts])
+        norm = np.sqrt(inner + add_terms(right**2))
+        factored, sign = factor_nodes(program, fronts, 1, self.sums is not None)
+        removable = np.concatenate([front.rows[:, -1] for front in factored])
+        reducible = np.sqrt(inner + add_terms(removable**2))
+        y = {node: part[:, 0] for node, part in solve_nodes(program, factored, 1)}
         sign, pivot = reduce(np.multiply, signs) * sign, reduce(np.minimum, pivots)
         twist = np.zeros((6 * len(program.nodes), N))
         for node, freedoms in enumerate(program.nodes):
@@ -433,32 +412,26 @@ class _Equations:
         return out
 
     def _eliminate(
-        self, i: int, bodies: FloatArray, theta: FloatArray, together: bool
+        self, i: int, bodies: FloatArray, theta: FloatArray
     ) -> tuple[FloatArray, list[Front], FloatArray, FloatArray]:
         """Eliminate the joints of the limbs in group i.
 
         Returns the rows (u, columns, k, N) that determine these joints, the rows without them, and
-        the sign of the determinant and the smallest relative pivot (N,). Rows `together` are one
-        matrix with N right sides.
+        the sign of the determinant and the smallest relative pivot (N,).
         """
         program, group, unknown = self.program, self.program.groups[i], self.unknown[i]
         chain, u = Chain(group, self.links[i], bodies, theta, program.size), len(unknown)
-        columns = [chain.rows_of_joint(j) for j in unknown]
-        columns += chain.list_slopes(program)
+        columns = chain.list_slopes(program)
         if self.sums is not None:
             columns += [self._list_drive(chain, column) for column in range(program.n_joints)]
         if self.redundant:
             j = int(np.flatnonzero(group.actuator[:, 0] >= 0)[0])
             sigma = np.array(program.sigma)[group.actuator[j], None]
             columns.append(chain.rows_of_joint(j) * sigma)
-        residual = chain.residual()
-        sides = residual.shape[-1] if together else 1
-        rows = chain.stack(*columns, right=sides)
-        rows[:, -sides:] = residual.swapaxes(1, 2)[..., None] if together else residual[:, None]
-        sign = pivot = np.ones(residual.shape[-1])
+        rows = chain.reduce(unknown, *columns, chain.residual())
+        sign = pivot = np.ones(rows.shape[-1])
         if u:
             count = count_reflections(len(rows), u) * len(group.limbs)
-            rows = triangularize(rows, u, overwrite=True)
             diagonal = np.diagonal(rows[:u, :u])
             sign = (-1.0) ** count * np.prod(np.sign(diagonal), axis=(0, 2))
             largest = np.maximum(np.abs(diagonal).max(axis=-1), 1e-300)
@@ -471,9 +444,8 @@ class _Equations:
         ]
         if self.redundant:
             # each row in standard deviations of the actuator that drives its limb
-            m = len(columns) - u - 1
             fronts = [
-                Front(nodes, np.delete(low / np.abs(low[:, m, None]), m, axis=1))
+                Front(nodes, np.delete(low / np.abs(low[:, -2, None]), -2, axis=1))
                 for nodes, low in fronts
             ]
         return rows[:u], fronts, sign, pivot

@@ -54,7 +54,7 @@ def factor_nodes(
         m = program.widths[node]
         nodes, rows = _join(program, node, [f for f in left if node in f.nodes], sides, left[0])
         count = count_reflections(len(rows), m)
-        rows = triangularize(rows, m, overwrite=True)
+        rows = triangularize(rows, m)
         signs = np.sign(np.diagonal(rows[:m, :m]))
         sign = sign * (-1.0) ** count * np.multiply.reduce(signs, axis=-1)
         factored.append(Front(nodes, rows[:m]))
