@@ -13,7 +13,7 @@ from tests.engine.cases import Case, make_case
 
 HAS_NATIVE = find_spec("loopcal_native") is not None
 ENGINES = ["numpy", "native"] if HAS_NATIVE else ["numpy"]
-OPTIONAL = ["test_compare_poses.py", "test_triangles.py"]
+OPTIONAL = ["test_certify.py", "test_compare_poses.py", "test_triangles.py"]
 """Tests of functions that an engine need not have; NumPy leaves them to other packages."""
 collect_ignore = [] if HAS_NATIVE else ["native", *OPTIONAL]
 

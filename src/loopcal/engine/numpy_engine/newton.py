@@ -199,6 +199,9 @@ def solve(
     unknown = [g.unknown_joints(free) for g in program.groups]
     redundant = program.sigma is not None and not free
     begin = list_coordinates(program, q, start, (t, n))
+    is_plain = task is None and sums is None and not (free or redundant)
+    has_rods = is_plain and not any(g.joints for g in program.groups)
+    together = has_rods and len(e) == 1 and start.T.shape[:2] == (1, 1)
     goals = None if goal is None else goal.T.reshape(t * n, 4, 4)[:, :3].transpose(1, 2, 0)
     chunks = []
     for part in divide_rows(t * n) or [slice(0)]:
@@ -210,7 +213,7 @@ def solve(
             own = Sums(weights, sums.values[part])
         equations = _Equations(program, unknown, redundant, placed, task, rows, own)
         goal_rows = None if goals is None else goals[..., part]
-        chunks.append(_iterate(equations, begin[:, part], max_iterations, goal_rows))
+        chunks.append(_iterate(equations, begin[:, part], max_iterations, goal_rows, together))
     whole = Solved(*(np.concatenate(arrays, axis=-1) for arrays in zip(*chunks, strict=True)))
     return _pack(program, whole, (t, n))
 
@@ -242,9 +245,16 @@ def follow_by(
 
 
 def _iterate(
-    equations: _Equations, coordinates: FloatArray, max_iterations: int, goal: FloatArray | None
+    equations: _Equations,
+    coordinates: FloatArray,
+    max_iterations: int,
+    goal: FloatArray | None,
+    together: bool,
 ) -> Solved:
-    """Iterate rows until each has converged, is near its goal (3, 4, N), or failed."""
+    """Iterate rows until each has converged, is near its goal (3, 4, N), or failed.
+
+    together : whether all rows begin with one Jacobian.
+    """
     program, N = equations.program, coordinates.shape[1]
     size = program.size
     closed_gap, short_step = RESIDUAL * size, STEP * size
@@ -255,7 +265,7 @@ def _iterate(
     share, applied, at_rounding = np.ones(N), np.full(N, np.inf), np.zeros(N)
     alive = np.arange(N)
     with np.errstate(all="ignore"):
-        now = equations.evaluate(coordinates)
+        now = equations.evaluate(coordinates, together)
         # some coordinates are in no equation
         now = now._replace(pivot=now.pivot * np.isfinite(np.add.reduce(coordinates[:12], axis=0)))
         for step in range(max_iterations):
@@ -346,10 +356,14 @@ class _Equations:
                 q[group.actuator[j]] = theta[j]
         return add_terms(self.sums.weights.T * q[:, None]) - self.sums.values.T
 
-    def evaluate(self, coordinates: FloatArray) -> Iterate:
-        """Return the Newton step at these coordinates and its measures."""
+    def evaluate(self, coordinates: FloatArray, together: bool = False) -> Iterate:
+        """Return the Newton step at these coordinates and its measures.
+
+        together : all rows have the Jacobian of the first one.
+        """
         program, N = self.program, coordinates.shape[1]
         bodies, limbs = split_bodies(program, coordinates), split_joints(program, coordinates)
+        sides, bodies = (N, bodies[..., :1]) if together else (1, bodies)
         eliminated = [self._eliminate(i, bodies, theta) for i, theta in enumerate(limbs)]
         tops, lows, signs, pivots = map(list, zip(*eliminated, strict=True))
         fronts = [front for of_group in lows for front in of_group]
@@ -367,12 +381,12 @@ class _Equations:
         for top in tops:
             if len(top):
                 inner += add_terms(add_terms(top[:, -1] ** 2))
-        right = np.concatenate([front.rows[:, -1] for front in fronts])
-        norm = np.sqrt(inner + add_terms(right**2))
-        factored, sign = factor_nodes(program, fronts, 1, self.sums is not None)
-        removable = np.concatenate([front.rows[:, -1] for front in factored])
-        reducible = np.sqrt(inner + add_terms(removable**2))
-        y = {node: part[:, 0] for node, part in solve_nodes(program, factored, 1)}
+        right = np.concatenate([front.rows[:, -sides:] for front in fronts])
+        norm = np.sqrt(inner + add_terms(right**2).reshape(N))
+        factored, sign = factor_nodes(program, fronts, sides, self.sums is not None)
+        removable = np.concatenate([front.rows[:, -sides:] for front in factored])
+        reducible = np.sqrt(inner + add_terms(removable**2).reshape(N))
+        y = {node: part.reshape(-1, N) for node, part in solve_nodes(program, factored, sides)}
         sign, pivot = reduce(np.multiply, signs) * sign, reduce(np.minimum, pivots)
         twist = np.zeros((6 * len(program.nodes), N))
         for node, freedoms in enumerate(program.nodes):
@@ -417,7 +431,8 @@ class _Equations:
         """Eliminate the joints of the limbs in group i.
 
         Returns the rows (u, columns, k, N) that determine these joints, the rows without them, and
-        the sign of the determinant and the smallest relative pivot (N,).
+        the sign of the determinant and the smallest relative pivot (N,). Rows with one Jacobian are
+        one matrix with N right sides.
         """
         program, group, unknown = self.program, self.program.groups[i], self.unknown[i]
         chain, u = Chain(group, self.links[i], bodies, theta, program.size), len(unknown)
@@ -428,8 +443,13 @@ class _Equations:
             j = int(np.flatnonzero(group.actuator[:, 0] >= 0)[0])
             sigma = np.array(program.sigma)[group.actuator[j], None]
             columns.append(chain.rows_of_joint(j) * sigma)
-        rows = chain.reduce(unknown, *columns, chain.residual())
-        sign = pivot = np.ones(rows.shape[-1])
+        residual, N = chain.residual(), theta.shape[-1]
+        if residual.shape[-1] == chain.gap.shape[-1]:
+            rows = chain.reduce(unknown, *columns, residual)
+        else:
+            right = residual.swapaxes(1, 2)[..., None]
+            rows = np.concatenate([chain.reduce(unknown, *columns), right], axis=1)
+        sign = pivot = np.ones(N)
         if u:
             count = count_reflections(len(rows), u) * len(group.limbs)
             diagonal = np.diagonal(rows[:u, :u])

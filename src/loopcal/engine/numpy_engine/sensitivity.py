@@ -203,11 +203,11 @@ def fold_poses(
         rows = []
         for twists in observed:
             residual = np.where(ok[:, twists.poses, None], twists.residual[part], 0.0)
-            whole = np.empty((*residual.shape, D.shape[3] + 1))
+            whole = np.empty((*residual.shape, D.shape[-1] + 1))
             # one order of the products for any number of trials: each has its bits by itself
             np.matmul(take(twists.by_twist), D[:, twists.poses], out=whole[..., :-1])
             whole[..., -1] = residual
-            rows.append(whole.reshape(len(whole), -1, whole.shape[3]))
+            rows.append(whole.reshape(len(whole), -1, D.shape[-1] + 1))
         folded[part] = fold(factor[part], np.concatenate(rows, axis=1))
     return folded, is_finite
 
