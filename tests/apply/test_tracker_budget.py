@@ -18,6 +18,8 @@ from loopcal.estimate.options import FitOptions
 from loopcal.estimate.penalties import MAP
 from loopcal.measure.simulation import sample_truth
 from loopcal.mechanism.workspace import sample_workspace
+from loopcal.report.calibration_view import build_gum_tables
+from loopcal.results.serialization import json_fields
 
 STATION = np.array([1.4, -0.9, 0.6])
 POSES = 20
@@ -140,6 +142,29 @@ def test_lines_state_the_values_of_the_certificates(case):
     }
     assert stated["position, range"].divisor == 2.0
     assert stated["position, centering"].divisor == pytest.approx(3**0.5)
+
+
+def test_each_line_has_its_value_or_says_where_its_size_is_from(case, tmp_path):
+    """Of standard deviations that a file states for each point, the root mean square."""
+    data, *_ = case
+    sizes = np.tile([8.0, 24.0], len(data.readings))[: len(data.readings)]
+    path = write_data(tmp_path / "each.csv", data.readings, data.observations[0].measured)
+    *settings, head = path.read_text().splitlines()[:7]
+    rows = path.read_text().splitlines()[7:]
+    lines = [*settings[:3], f"{head},sigma.x [um],sigma.y [um],sigma.z [um]"]
+    lines += [f"{row},{s:g},{s:g},{s:g}" for row, s in zip(rows, sizes, strict=True)]
+    path.write_text("\n".join(lines))
+    own = lc.load_measurements(path, ROBOT)
+    for fitted in (data, own):
+        fit = identify(ROBOT, fitted, options=FitOptions(method=MAP(), sigma_uncertainty=0.0))
+        budget = json_fields(compute_error_budget(fit, fitted, "base"))
+        for table in build_gum_tables(budget, ROBOT):
+            *lines, _ = table.rows
+            assert all(len(value) > 1 for _, _, value, *_ in lines)
+    instrument, tolerances, *_ = lines
+    rms = np.sqrt((sizes**2).mean())
+    assert instrument[2:5] == (f"{rms:.3g} um", "normal, rms", "1")
+    assert tolerances[2] == "by parameter"
 
 
 def test_halving_the_range_is_a_new_budget_with_half_the_range(case, tmp_path):

@@ -12,7 +12,7 @@ from loopcal.cli.entry_point import main
 from loopcal.errors import FileError
 from loopcal.io.data.measurement_file import load_measurements
 from loopcal.io.exports.conversion import Conversion, convert_export
-from loopcal.io.exports.profile import read_profile
+from loopcal.io.exports.profile import find_profile_file, read_profile
 from loopcal.measure.initial_values import evaluate_measurements, guess_nuisance_values, whiten_rows
 from loopcal.mechanism.solutions import forward
 from tests.io import export_texts, test_profiles
@@ -106,6 +106,16 @@ def test_names_with_commas_quotes_and_number_signs_are_kept(tmp_path, robot) -> 
     np.testing.assert_array_equal(
         data.observations[0].measured, [[0.0015, 0.002, 0.003], [0.004, 0.005, 0.0006]]
     )
+
+
+def test_columns_that_a_profile_does_not_use_are_named_once(tmp_path) -> None:
+    for name, export in {"faro": "Name,RMS,X,Y,Z,Nominal X,\n", "leica": ""}.items():
+        mark, ending = (",", ",7,8") if export else (" ", " 7")
+        cells = (["1_SMR1", *["7"] * bool(export), "1", "2", "3"] for _ in range(2))
+        path = tmp_path / f"{name}.txt"
+        path.write_text(export + "".join(mark.join(row) + ending + "\n" for row in cells))
+        (finding,) = convert_export(path, read_profile(find_profile_file(name))).findings
+        assert finding.data["columns"] == (["RMS", "Nominal X"] if export else ["5"])
 
 
 def test_lines_that_do_not_fit_are_listed_in_result_and_file(tmp_path) -> None:

@@ -119,7 +119,7 @@ REPORTS = {
 
 
 @pytest.mark.parametrize("name", REPORTS)
-def test_reported_heights_lead_to_the_truth(name: str) -> None:
+def test_reported_heights_lead_to_the_truth(name: str, capsys) -> None:
     text, offset, files = REPORTS[name]
     config = "m503.gcode" if text.startswith(MARLIN) else "config.g"
     Path(config).write_text(text)
@@ -128,7 +128,10 @@ def test_reported_heights_lead_to_the_truth(name: str) -> None:
     assert np.ptp(heights) > 0.1
     for file, form in files.items():
         write_points(POINTS, heights, file, *form)
+    capsys.readouterr()
     check_calibration(" ".join([config, *(f"--probes {file}" for file in files)]), truth)
+    place = f"The probe is at x {offset[0]:g} mm, y {offset[1]:g} mm from the nozzle"
+    assert (place in " ".join(capsys.readouterr().out.split())) == any(offset)
 
 
 def test_a_height_entered_as_z_would_move_the_radius_in_the_wrong_direction() -> None:
@@ -382,6 +385,31 @@ def test_a_report_in_place_of_the_configuration_is_named(capsys) -> None:
     write_points(POINTS, [0.0] * len(POINTS))
     assert run("import report.txt --probes config.g -o p.yaml --data h.csv") == 1
     assert "This is a probe report" in capsys.readouterr().err
+
+
+def test_joined_logs_without_dates_are_named_as_a_cause(capsys) -> None:
+    """As text of the import, and as a warning where the residuals exceed the noise."""
+    robot, truth = make_truth("m503.gcode")
+    for name, shift in (("a", 0.0), ("b", 0.4)):  # an end stop moved in between
+        moved = truth.with_values(truth.values + 1e-3 * shift * make_stop(robot))
+        write_points(POINTS, probe(robot, moved, POINTS), f"{name}.txt")
+        words = f"import m503.gcode --probes {name}.txt -o p.yaml --data {name}.csv --force"
+        assert run(f"{words} --sigma-height 0.01mm") == 0
+        assert "without dates" not in capsys.readouterr().out
+    assert run("import m503.gcode --probes a.txt --probes b.txt -o q.yaml --data q.csv") == 0
+    words = "Several files without dates measure the same."
+    assert words in " ".join(capsys.readouterr().out.split())
+    text = Path("b.csv").read_text().splitlines()
+    Path("b.csv").write_text("\n".join("b" + r if r[0].isdigit() else r for r in text))
+    assert run("calibrate p.yaml a.csv b.csv -o run") == 2
+    assert f"warning {words}" in " ".join(capsys.readouterr().out.split())
+    assert run("calibrate p.yaml a.csv -o run2 --verbose") == 0
+    assert words not in " ".join(capsys.readouterr().out.split())
+
+
+def make_stop(robot) -> np.ndarray:
+    """Return the change of the first end stop by 1 m."""
+    return np.array([float(name == "tower1.stop") for name in robot.parameters.names])
 
 
 def test_height_maps_of_two_days_are_named(capsys) -> None:

@@ -10,6 +10,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import loopcal as lc
+from loopcal.units import find_unit
 from tests.report.test_figures import check
 
 FIVE_BAR = Path(lc.__file__).parent / "robots" / "five-bar.yaml"
@@ -69,7 +70,8 @@ def test_budget_shows_and_lists_the_part_of_every_source(linear_delta) -> None:
     axes = figure.axes[0]
     parts = [bar.get_width() for bar in axes.patches]
     table = budget.to_frame()
-    assert_allclose(parts, 1e3 * table["position [m]"])
+    unit = find_unit(axes.get_xlabel().partition("[")[2][:-1])
+    assert_allclose(np.multiply(parts, unit.factor_to_si), table["position [m]"])
     assert np.sqrt((table["position [m]"] ** 2).sum()) == pytest.approx(budget.position.rms)
     assert [label.get_text() for label in axes.get_yticklabels()] == list(table.source)
     variances = budget.to_dataset().parameter_variance.sum("source")

@@ -76,7 +76,7 @@ from loopcal.findings import Finding, Severity, report_finding, sort_by_importan
 from loopcal.measure.array_checks import check_type
 from loopcal.measure.data_checks import check_duplicates, check_types
 from loopcal.measure.measurements import Measurements
-from loopcal.measure.observations import check_instruments
+from loopcal.measure.observations import SEVERAL_DAYS, check_instruments
 from loopcal.measure.readings import fill_in_reading_sigma
 from loopcal.mechanism.model import Mechanism
 from loopcal.results.deferred import later
@@ -331,17 +331,21 @@ def _report(
     if outliers:  # that none were found among fewer poses says nothing then
         examined = tuple(finding for finding in examined if finding.code != "outliers.none")
     repeats = tuple(f"pose {label}" for label in split.repeats)
+    is_failed = fit.residual_test.failed
     findings = [
         # fit and validation answer doubts about conventions
         *(replace(finding, severity=Severity.INFO) for finding in doubts),
         *(s for f in doubts for s in find_swapped_pictures(fit, fitted, f.data.get("poses", ()))),
         *report_fit(fit),
         *report_unexplained(fit, examined),
+        *(  # the machine may have changed between days
+            replace(f, severity=Severity.WARNING) if is_failed and f.code == SEVERAL_DAYS else f
+            for f in check_instruments(split.list_observations())
+        ),
         *impossible,
         *(report_validation(errors, held_out is not None) if fit.converged else ()),
         *of_volume,
         *([report_finding("workflow.held-out-repeats", names=repeats)] if repeats else []),
-        *check_instruments(split.list_observations()),
         *report_freedoms(fit, fitted),
         *report_fixed_setup(fitted),
         *report_picture_scale(fit.robot, fitted),

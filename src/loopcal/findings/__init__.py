@@ -106,7 +106,7 @@ conformity.fails gates.limit-exceeded gates.limit-not-measured conformity.undeci
 outliers.all-poses outliers.some outliers.pose outliers.ambiguous outliers.search-not-converged
 outliers.swapped-picture residuals.print-scale residuals.zoomed-picture residuals.moving-picture
 residuals.board-moved
-outliers.conflict
+outliers.conflict data.several-days
 workflow.no-held-out-poses workflow.few-held-out-poses workflow.held-out-setup
 workflow.undetermined-combinations validation.setup-moved
 prior.machine-changed prior.agree-too-well prior.tolerances-inflated

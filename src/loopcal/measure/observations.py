@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from copy import copy
 from dataclasses import asdict, dataclass, field, replace
@@ -40,6 +41,8 @@ SIZE_UNITS = {  # of standard deviations that a program stated
     Dimension.PIXEL: ("px", 1.0),
 }
 DATES = ("calibrated", "due", "measured")  # fields of an instrument that hold a date
+VARYING = "normal, rms"  # distribution where the value is that of several
+SEVERAL_DAYS = "data.several-days"  # code of a finding
 TextArray = NDArray[np.str_]  # names of sessions or groups
 
 
@@ -51,17 +54,22 @@ class StatedSize:
 
     value: float
     unit: str
-    distribution: str = "normal"  # or "uniform", from -value to value
+    distribution: str = "normal"  # or "uniform", from -value to value, or VARYING
     divisor: float = 1.0
 
 
 def find_size(sd: FloatArray, dimensions: Iterable[Dimension]) -> StatedSize | None:
-    """Return the standard deviation [SI] that all values have; None where they differ."""
-    units, first = {SIZE_UNITS[dimension] for dimension in dimensions}, sd[:1]
-    if len(units) != 1 or not first.size or np.any(np.abs(sd - first) > ROUNDING * first):
+    """Return the standard deviation [SI] that all values have, or their root mean square; None
+    where their units differ.
+    """
+    units = {SIZE_UNITS[dimension] for dimension in dimensions}
+    if len(units) != 1 or not sd.size:
         return None
-    symbol, factor = units.pop()
-    return StatedSize(float(f"{float(first[0]) / factor:.12g}"), symbol)
+    (symbol, factor), first = units.pop(), float(sd[0])
+    if np.any(np.abs(sd - first) > ROUNDING * first):
+        rms = float(np.sqrt(np.mean(sd**2)))
+        return StatedSize(float(f"{rms / factor:.3g}"), symbol, VARYING)
+    return StatedSize(float(f"{first / factor:.12g}"), symbol)
 
 
 class NoisePart(NamedTuple):
@@ -226,10 +234,21 @@ def check_instruments(observations: Sequence[Observations]) -> list[Finding]:
             findings.append(report_finding("data.instrument-past-due", **stated))
         elif record.measured and record.measured < record.calibrated:
             findings.append(report_finding("data.instrument-calibrated-later", **stated))
-    days = sorted({record.measured for record in list_instruments(observations)} - {""})
-    if len(days) > 1:
-        findings.append(report_finding("data.several-days", days=days))
-    return findings
+    # each file has its own kinds, and those with equal settings measure the same
+    days = {id(o.kind): o.instrument.measured if o.instrument else "" for o in observations}
+    kinds = Counter({id(o.kind): repr(o.kind) for o in observations}.values())
+    joined = (days[id(o.kind)] for o in observations if kinds[repr(o.kind)] > 1)
+    return [*findings, *report_days([*joined, *filter(None, days.values())])]
+
+
+def report_days(days: Sequence[str]) -> list[Finding]:
+    """Return that measurements of several files are from several days, or of unknown ones, which
+    are empty here.
+    """
+    known = sorted({*days} - {""})
+    if len(known) < 2 and not (len(days) > 1 and "" in days):
+        return []
+    return [report_finding(SEVERAL_DAYS, days=known, is_open="" in days)]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -445,10 +464,10 @@ class Observations:
         rest = drop_repeats(self.covariance) - sum(drop_repeats(p.covariance) for p in parts)
         least = ROUNDING * np.where(self.present, variance, np.inf)
         if not parts or np.any(np.einsum("rii->ri", rest) < -least):  # or of another covariance
-            dimensions = {column.dimension for column in self.kind.noise_columns}
-            return [("", find_size(np.sqrt(variance[self.present]), dimensions), None)]
-        if np.any(np.abs(rest) > least[:, :, None]):
+            parts = [NoisePart("", self.covariance)]
+        elif np.any(np.abs(rest) > least[:, :, None]):
             parts.append(NoisePart("", rest))
+        parts = [part._replace(size=part.size or self._find_size(part)) for part in parts]
         if len(parts) == 1:
             return [(parts[0].name, parts[0].size, None)]
         W = drop_repeats(self.whitener)
@@ -461,6 +480,12 @@ class Observations:
             root = axes * np.sqrt(np.maximum(share, 0.0))[:, None] @ np.swapaxes(axes, 1, 2)
             split.append((part.name, part.size, np.broadcast_to(root, self.whitener.shape)))
         return split
+
+    def _find_size(self, part: NoisePart) -> StatedSize | None:
+        """Return the standard deviation of a part of the noise."""
+        variance = np.einsum("rii->ri", np.broadcast_to(part.covariance, self.covariance.shape))
+        dimensions = {column.dimension for column in self.kind.noise_columns}
+        return find_size(np.sqrt(variance[self.present]), dimensions)
 
     def with_weights(self, weight: ArrayLike) -> Self:
         """Return the same rows with other weights (r,)."""

@@ -9,7 +9,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from loopcal.apply.error_budget import LENGTHS, Source
+from loopcal.apply.error_budget import (
+    COMMON,
+    EARLIER,
+    INSTRUMENT,
+    LENGTHS,
+    READINGS,
+    SETUP,
+    TOLERANCES,
+    Source,
+)
 from loopcal.apply.volume_accuracy import CONDITIONS
 from loopcal.diagnose.fit_examination import ROUNDING
 from loopcal.diagnose.row_errors import METRICS, SUMMARY
@@ -331,7 +340,7 @@ def build_budget_table(budget: Mapping[str, Any], robot: Mechanism) -> Table:
     """
     worst, table, units = budget["worst_parameter"], robot.parameters, robot.shown_units
     total = {**{kind: budget[kind]["rms"] for kind in LENGTHS}, **budget["parameters"]}
-    shown = {k: choose_unit(units[LENGTHS[k]], [total[k]]) for k in _list_kinds(budget)}
+    shown = {k: choose_unit(units[LENGTHS[k]], [total[k]], FINE) for k in _list_kinds(budget)}
     if worst:
         unit = robot.get_unit(table.entries[table.index(worst)].dimension)
         shown[worst] = choose_unit(unit, [total[worst]])
@@ -367,6 +376,11 @@ def build_budget_table(budget: Mapping[str, Any], robot: Mechanism) -> Table:
     return make_table(caption, ("source", "type", Column("degrees of freedom"), *columns), rows)
 
 
+# Kind of a source without one value -> where its size is from; else residuals gave it.
+UNSTATED = {TOLERANCES: "by parameter", SETUP: "estimated", EARLIER: "earlier run"}
+UNSTATED |= {READINGS: "from the data", INSTRUMENT: "several values", COMMON: "several values"}
+
+
 def build_gum_tables(budget: Mapping[str, Any], robot: Mechanism) -> list[Table]:
     """Return the budget of positions, and of orientations, as JCGM 100 arranges one."""
     return [_build_gum_table(budget, robot, kind) for kind in _list_kinds(budget)]
@@ -378,7 +392,7 @@ def _build_gum_table(budget: Mapping[str, Any], robot: Mechanism, kind: str) -> 
     rows = []
     for line in budget["sources"]:
         stated, error = line.get("stated"), math.sqrt(line[kind] or 0.0)
-        cells = [ABSENT] * 5
+        cells = [UNSTATED.get(line["kind"], "from residuals"), *[ABSENT] * 4]
         if stated:
             of = choose_coarser(UNITS[stated["unit"]], stated["value"])
             factor = UNITS[stated["unit"]].factor_to_si / of.factor_to_si

@@ -18,6 +18,7 @@ Before it is written, the points are to be examined:
 from __future__ import annotations
 
 import csv
+import itertools
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -146,6 +147,17 @@ def read_lines(
     if named and header is None:
         _refuse_header(path, profile, named, nearest)
     return lines, skipped
+
+
+def _report_unused(line: Line, profile: Profile) -> tuple[Finding, ...]:
+    """Return which columns of a line the profile does not use: names of a header, or numbers."""
+    places = (of.places for each in profile.columns_by_target.values() for of in each.values())
+    used = {*itertools.chain(*places), *profile.record.matrix}
+    numbers = {str(i + 1): i for i in range(len(line.cells))}
+    names = numbers if line.header is None else line.header.places
+    ordered = sorted(names, key=names.__getitem__)
+    unused = [name for name in ordered if name and not {name, names[name] + 1} & used]
+    return (report_finding("files.export-columns-unused", columns=unused),) if unused else ()
 
 
 def _refuse_header(
@@ -404,6 +416,7 @@ def convert_export(
             # nothing shows that the profile is meant for this file, which may contain secrets
             raise FileError(f"{sentence}. Compare the first one with the profile", path, number)
         raise FileError(f"{sentence}; reason for the first one: {reason}", path, number)
+    findings += _report_unused(fitting[0][0], profile)
     settings = {"format": FORMAT, **profile.record.settings}
     remark = format_comment(f"converted from {path.name} by {profile.file.path.name}")
     lines = [f"## {remark}"]

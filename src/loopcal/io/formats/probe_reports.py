@@ -130,19 +130,23 @@ def read_reports(
     """Return the probed points of the reports of a firmware, and findings about them; FileError
     where there are none. `probe` : X, Y and Z that files state of it [mm].
     """
+    from loopcal.measure.observations import report_days
+
     texts = {path: read_text(path, "probe report") for path in paths}
     read = _read_marlin if firmware == "marlin" else _read_reprap
     probed, touched, noted = read(texts, probe)
     missing = tuple(letter for letter in "XY" if letter not in probe)
+    x, y = probe.get("X", 0.0), probe.get("Y", 0.0)
     if probed and missing:
         facts = {"letters": missing, "firmware": firmware}
         noted.append(report_finding("files.probe-place-assumed", **facts))
-    x, y = probe.get("X", 0.0), probe.get("Y", 0.0)
+    elif probed and (x or y):
+        facts = {"x": Quantity(x, "mm"), "y": Quantity(y, "mm"), "firmware": firmware}
+        noted.append(report_finding("files.probe-place", **facts))
     points = [p._replace(x=p.x - x, y=p.y - y) for p in probed]
     points += touched if firmware == "reprap" or not probed else []
-    dates = sorted({time[:10] for time in _list_times(texts.values())})
-    if len(dates) > 1:
-        noted.append(report_finding("files.reports-of-dates", dates=dates))
+    dates = [_list_times([text]) or [""] for text in texts.values() if ANSWER.search(text)]
+    noted += report_days([time[:10] for of_file in dates for time in of_file])
     if not points:
         raise FileError(report_finding("files.no-probe-report", firmware=firmware), paths[0])
     return points, noted

@@ -136,7 +136,7 @@ def draw_budget_sources(budget: Mapping[str, Any]) -> Figure:
     width, height = 4.8 * len(kinds) + 1.5, 1.9 + 0.38 * len(lines)
     figure, (panels,) = start_panels(width, height, 1, len(kinds), sharey=True)
     for axes, kind in zip(panels, kinds, strict=True):
-        unit = choose_unit(DISPLAY_UNITS[LENGTHS[kind]], [budget[kind]["rms"]])
+        unit = choose_unit(DISPLAY_UNITS[LENGTHS[kind]], [budget[kind]["rms"]], FINE)
         rms_by_source = np.sqrt([line[kind] for line in lines]) / unit.factor_to_si
         total = budget[kind]["rms"] / unit.factor_to_si
         axes.barh(np.arange(len(lines)), rms_by_source, height=0.6, color=COLORS[5])
