@@ -371,7 +371,7 @@ def test_a_session_in_a_terminal_of_80_columns(rows) -> None:
     try:
         wait_for("or help:")
         subprocess.run([*tmux, "send-keys", join(rows[0]), "Enter"], check=True)
-        screen = wait_for("no judgement of pose")
+        screen = wait_for("cannot judge pose")
         while not screen.rstrip().endswith("or help:"):  # it asks for the next row
             screen = wait_for("or help:")
         assert len(screen.rstrip().splitlines()) == 23  # the last answer and question are visible

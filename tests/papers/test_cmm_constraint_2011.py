@@ -587,7 +587,7 @@ def test_another_robot_is_judged_in_its_tolerances_and_without_what_it_lacks() -
     tables = {table.name: table for table in make_tables(of_delta)}
     titles = [title for table in tables.values() for title in table.columns]
     assert not [title for title in titles if "orientation" in title]
-    assert f"{DETERMINED} [tolerances]" in tables["table_3"].columns
+    assert f"{DETERMINED} [spreads]" in tables["table_3"].columns
     sets = [row[0] for row in tables["table_3"].rows]
     assert list(dict.fromkeys(sets)) == ["0.01 tolerances", "0.1 tolerances", "1 tolerance"]
     presented = PAPERS["cmm-constraint-2011"].present(of_delta, 0, 2, case)

@@ -162,7 +162,7 @@ class RobustSpread(NamedTuple):
         return self.correction > 0.0
 
     def compare(self, effect: FloatArray) -> Ratio:
-        """Return the ratio for what changes by effect (m, p) times deviations [tolerances]."""
+        """Return the ratio for what changes by effect (m, p) times deviations [spreads]."""
         root = effect @ self.root
         total = float((root**2).sum())
         if not total > 0.0:

@@ -155,7 +155,7 @@ class ValueComparison(DeferredFields, TableResult):
 
     @property
     def rms(self) -> float:
-        """Root mean square of the error [tolerances] over compared directions; NaN without any."""
+        """Root mean square of the error [spreads] over compared directions; NaN without any."""
         if not self.compared:
             return float("nan")
         return float(np.sqrt(np.sum(self.tolerances**2) / self.compared))
@@ -205,7 +205,7 @@ class ValueComparison(DeferredFields, TableResult):
         return (
             f"<ValueComparison: {len(self.names)} parameters, {self.degrees} directions, "
             f"chi-square {round_to_digits(self.chi_square, 4)} "
-            f"(p = {round_to_digits(self.p_value, 2)}), rms {round_to_digits(self.rms)} tolerances>"
+            f"(p = {round_to_digits(self.p_value, 2)}), rms {round_to_digits(self.rms)} spreads>"
         )
 
 

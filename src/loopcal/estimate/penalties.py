@@ -233,7 +233,7 @@ class LeastSquares(Method):
     """
 
     name: ClassVar[str] = "least-squares"
-    what: ClassVar[str] = "without tolerances"
+    what: ClassVar[str] = "without expected spreads"
     is_biased: ClassVar[bool] = False
 
     def required_equations(self, parameters: int) -> int:
@@ -448,7 +448,7 @@ class MAP(Method):
     def __post_init__(self) -> None:
         if not callable(self.inflation) and not 0.0 < self.inflation < np.inf:
             raise EstimationError(
-                f"tolerances times {self.inflation}: give a finite factor above 0, or a rule such "
+                f"spreads times {self.inflation}: give a finite factor above 0, or a rule such "
                 "as InflatedTolerances()"
             )
 

@@ -117,7 +117,7 @@ def recalibrate(
     if options.method is not None and not isinstance(options.method, LeastSquares):
         raise EstimationError(
             f"method is {options.method!r}; recalibration uses LeastSquares(), because the earlier "
-            "calibration replaces the tolerances"
+            "calibration replaces the spreads"
         )
     if options.loss is not None or options.prior is not None:
         name = "loss" if options.loss is not None else "prior"

@@ -69,7 +69,7 @@ class InflatedTolerances:
     def __post_init__(self) -> None:
         if self.by not in get_args(By):
             raise EstimationError(
-                f"inflated tolerances by {self.by!r}. Give 'global', 'groups', 'heavy-tailed' or "
+                f"inflated spreads by {self.by!r}. Give 'global', 'groups', 'heavy-tailed' or "
                 "'auto'"
             )
 

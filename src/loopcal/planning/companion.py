@@ -190,7 +190,7 @@ def solve_rows(rows: FloatArray, unit: FloatArray) -> PartialSolution:
 class VisitFit:
     """The estimate from some visits, and the rows of all visits at it."""
 
-    x: FloatArray  # (k,) setup [SI] and deviations of the machine [tolerances]
+    x: FloatArray  # (k,) setup [SI] and deviations of the machine [spreads]
     unit: FloatArray  # (k,) see `solve_rows`; infinite for the machine
     rows: VisitRows
     prior: FloatArray  # (., k + 1) whitened rows of the spreads there

@@ -312,8 +312,8 @@ def format_robot(samples: Samples, anchors: FloatArray, path: Path, options: Imp
             "z": [0, round_length(0.5 * max(anchors[:, 2].max(), lengths.min()))],
         },
     }
-    taped = ", measured by hand within their tolerances" if is_taped.any() else ""
-    origin = "prior knowledge" if is_prior else "first estimates with their tolerances"
+    taped = ", measured by hand within their spreads" if is_taped.any() else ""
+    origin = "prior knowledge" if is_prior else "first estimates with their spreads"
     comments = {
         **COMMENTS,
         "actuators": "radius: line paid out per radian of the motor; "

@@ -169,10 +169,10 @@ class Study:
         free = self.planned.free
         factor, symbols = free.display()
         is_one = set(symbols) == {"mm"} and np.ptp(free.tolerance) <= 1e-9 * free.tolerance[0]
-        return (float((free.tolerance / factor)[0]), "mm") if is_one else (1.0, "tolerances")
+        return (float((free.tolerance / factor)[0]), "mm") if is_one else (1.0, "spreads")
 
     def describe_errors(self, size: float | str) -> str:
-        """Return the standard deviation of errors of so many tolerances in words."""
+        """Return the standard deviation of errors of so many spreads in words."""
         number, unit = float(size) * self.unit[0], self.unit[1]
         return f"{number:.3g} {unit.removesuffix('s') if number == 1.0 else unit}"
 
@@ -183,7 +183,7 @@ class Study:
 
     @cached_property
     def spreads(self) -> tuple[float, float]:
-        """Rms standard deviation of the identifiable directions [tolerances per mm of noise] before
+        """Rms standard deviation of the identifiable directions [spreads per mm of noise] before
         and after coordinate exchange.
         """
         both = []
@@ -671,7 +671,7 @@ def _list_given(study: Study) -> published.Table:
     sets = ", ".join(study.describe_errors(level.tolerance_factor)
                      for level in study.grid.errors.values())  # fmt: skip
     history = ", ".join(f"{v:.1f}" for v in study.optimized.history)
-    exchange = f"log det {history} [tolerances, noise 1 mm]"
+    exchange = f"log det {history} [spreads, noise 1 mm]"
     rows += [("standard deviations of the errors", sets), ("points", each)]
     return TEXT.table("given", [*rows, ("coordinate exchange", exchange)])
 

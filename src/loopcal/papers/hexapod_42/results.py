@@ -220,8 +220,8 @@ def draw_reached(
     reached = forward(truth, drawn.solution.q, drawn.solution).converged
     if reached.sum() < n:
         raise DataError(
-            f"{robot.name} with errors by its tolerances reaches {int(reached.sum())} of "
-            f"{len(reached)} poses of its workspace. Give a smaller workspace or tolerances"
+            f"{robot.name} with errors by its spreads reaches {int(reached.sum())} of "
+            f"{len(reached)} poses of its workspace. Give a smaller workspace or spreads"
         )
     return drawn.coordinates[reached][:n]
 

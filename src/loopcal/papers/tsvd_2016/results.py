@@ -42,7 +42,7 @@ from loopcal.units import Dimension
 
 TEXT = published.PaperText(__file__)
 DIVERGED = "diverged"  # cell of a number that a diverged fit does not have
-ROUNDING = 1e-10  # size below which an error [mm, deg, tolerances] is rounding
+ROUNDING = 1e-10  # size below which an error [mm, deg, spreads] is rounding
 NOISE_COLUMNS = ("X [mm]", "Y [mm]", "Z [mm]", "phi [rad]", "theta [rad]", "psi [rad]")
 # Of a robot file, as far as it has them.
 DIMENSIONS = ("platform_radius", "base_radius", "rod", "post")
