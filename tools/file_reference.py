@@ -47,6 +47,13 @@ WORDS = {
 }
 """What a key holds -> the word that the page explains once."""
 Keys = list[file_reference.Key]
+SECTIONS = {
+    "Scale, temperature and maximum permissible error of an instrument": "scale temperature mpe",
+    "Errors that a session shares": "session_bias session_drift",
+    "Prior knowledge of instruments": "unknowns",
+    "Uncertain readings": "reading_noise",
+}
+"""Section of the page -> the settings that it describes."""
 BLOCK = r"made by tools.file_reference: (?P<name>[\w-]+)"
 
 
@@ -256,10 +263,13 @@ def _describe_columns(columns: Iterable[Column]) -> str:
 
 
 def format_settings() -> str:
-    """Return the settings of a measurement file."""
-    return format_table(
-        ("setting", "meaning"), [(f"`{key}`", words) for key, words in SETTINGS.items()]
-    )
+    """Return the settings of a measurement file; those with a section are only linked."""
+    own = {}
+    for title, keys in SECTIONS.items():
+        place = title.lower().replace(",", "").replace(" ", "-")
+        own |= dict.fromkeys(keys.split(), f"see [above](#{place})")
+    rows = merge_rows((f"`{key}`", own.get(key, words)) for key, words in SETTINGS.items())
+    return format_table(("setting", "meaning"), rows)
 
 
 def format_columns() -> str:
