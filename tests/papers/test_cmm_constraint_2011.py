@@ -580,7 +580,7 @@ def test_fits_that_did_not_converge_have_a_row_of_their_own() -> None:
 
 
 @pytest.mark.slow
-def test_another_robot_is_judged_in_its_tolerances_and_without_what_it_lacks() -> None:
+def test_another_robot_is_judged_in_its_spreads_and_without_what_it_lacks() -> None:
     """A delta: its platform does not turn, and its parameters are lengths and angles."""
     case = PAPERS["cmm-constraint-2011"].make_case("linear-delta")
     of_delta = compute(0, 2, lambda _: None, case, draws=1, sweeps=0)
@@ -589,7 +589,7 @@ def test_another_robot_is_judged_in_its_tolerances_and_without_what_it_lacks() -
     assert not [title for title in titles if "orientation" in title]
     assert f"{DETERMINED} [spreads]" in tables["table_3"].columns
     sets = [row[0] for row in tables["table_3"].rows]
-    assert list(dict.fromkeys(sets)) == ["0.01 tolerances", "0.1 tolerances", "1 tolerance"]
+    assert list(dict.fromkeys(sets)) == ["0.01 spreads", "0.1 spreads", "1 spread"]
     presented = PAPERS["cmm-constraint-2011"].present(of_delta, 0, 2, case)
     assert {v.name for v in presented.content.verdicts} == set(CHANGES)
     assert not presented.content.comparisons
