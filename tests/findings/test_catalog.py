@@ -170,7 +170,7 @@ IMPERATIVES = (
 )
 # Their texts end in a list of what is allowed, or state a decision that documents repeat; or they
 # are the state of one target of many.
-WITHOUT_ACTION = {"checks.options", "conformity.fails", "files.no-example"}
+WITHOUT_ACTION = {"conformity.fails", "files.no-example"}
 WITHOUT_ACTION |= {"compensation.outside-limits", "compensation.unreachable", "pictures.none"}
 
 
