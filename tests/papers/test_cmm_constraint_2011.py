@@ -597,7 +597,7 @@ def test_another_robot_is_judged_in_its_spreads_and_without_what_it_lacks() -> N
     why = {v.name: v.why for v in presented.content.verdicts}["three_quarters"]
     assert "at most 76 % in half of the draws, and 75 % in 51.4 % of the draws" in why
     assert "does not turn" in presented.replaced[-1]
-    assert "errors of 1 tolerance on linear-delta" in presented.replaced[-2]
+    assert "errors of 1 spread on linear-delta" in presented.replaced[-2]
 
 
 def test_a_hexapod_of_other_tolerances_has_sets_by_their_true_size() -> None:

@@ -165,7 +165,7 @@ class Study:
 
     @cached_property
     def unit(self) -> tuple[float, str]:
-        """A tolerance of all parameters in mm, if they are lengths of one spread; else one."""
+        """A spread of all parameters in mm, if they are lengths of one value; else one."""
         free = self.planned.free
         factor, symbols = free.display()
         is_one = set(symbols) == {"mm"} and np.ptp(free.tolerance) <= 1e-9 * free.tolerance[0]
