@@ -165,8 +165,6 @@ class RobustSpread(NamedTuple):
         """Return the ratio for what changes by effect (m, p) times deviations [spreads]."""
         root = effect @ self.root
         total = float((root**2).sum())
-        if not total > 0.0:
-            return NO_RATIO
         # Q = sum_g |E' h_g|^2 with E E' = root' root; for independent errors its mean is `mean`
         _, s, vt = np.linalg.svd(root, full_matrices=False)
         E = vt[s > COMMON * s[0]].T * s[s > COMMON * s[0]]

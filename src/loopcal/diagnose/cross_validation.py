@@ -43,7 +43,6 @@ from loopcal.estimate.penalties import (
     Ridge,
     TruncatedSVD,
     TruncationGCV,
-    adapt_method,
 )
 from loopcal.estimate.problem import problem_of
 from loopcal.findings import Finding, report_finding
@@ -222,22 +221,10 @@ def score_leave_one_out(
     """
     free = select_free_parameters(robot)
     problem = problem_of(free, data)
-    if problem.nuisance is not None:
-        raise EstimationError(
-            "leave-one-out of many methods needs known frames and targets. Give them, or use "
-            "cross_validate"
-        )
     z = free.deviation(robot.values[None])
     linearization = problem.linearize(z, problem.start(z))
     d = decompose(linearization.factor, linearization.equations, z)
-    stated = np.zeros(len(free), dtype=bool)
-    adapted = [adapt_method(method, free.names, stated, "given") for method in methods]
-    if any(method.root(len(free)) is not None for method in adapted):
-        raise EstimationError(
-            "leave-one-out of many methods penalizes all parameters alike. Use cross_validate for "
-            "one lam per parameter"
-        )
-    penalty = np.concatenate([method.penalty(d) for method in adapted])
+    penalty = np.concatenate([method.penalty(d) for method in methods])
     # 1 / (s^2 + penalty) and the coordinates y, both (k, p); zero for unused directions
     s, total = d.singular_values[0], d.singular_values[0] ** 2 + penalty
     used = (total > 0.0) & np.isfinite(total)

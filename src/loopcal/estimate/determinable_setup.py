@@ -198,8 +198,7 @@ def _linearize_setup(rows: Observations, T: FloatArray) -> FloatArray:
     noise = np.zeros((1, len(T), len(kind.noise_columns)))
     by_setup = kind.evaluate(T[None], kind.measure(T[None], noise), kind.nominal_values[None, None])
     u = len(kind.nuisance_parameters)
-    if by_setup.nuisance is None:
-        return np.zeros((0, u))
+    assert by_setup.nuisance is not None
     return (rows.whitener[best] @ by_setup.nuisance[0]).reshape(-1, u)
 
 

@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from numbers import Integral
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NoReturn
 
 import numpy as np
 
@@ -134,12 +134,8 @@ def check_count(problem: Problem, data: Measurements, options: FitOptions, z: Fl
     )
 
 
-def check_start(
-    problem: Problem, data: Measurements, deviation: FloatArray, cost: FloatArray
-) -> None:
+def refuse_start(problem: Problem, data: Measurements, deviation: FloatArray) -> NoReturn:
     """Refuse a start at which some residuals are not finite, with the poses."""
-    if np.isfinite(cost[0]):
-        return
     start = problem.start(deviation)
     lost = problem.poses.find_unreached(deviation, start)
     if len(lost) > 0:
@@ -216,7 +212,7 @@ def identify(
     check_count(problem, data, options, z)
     fit, weights, weighted, options = fit_with_tolerances(problem, data, z, options, free, progress)
     if fit.status[0] == DescentStatus.BAD_START.value:
-        check_start(problem, data, z, fit.cost)
+        refuse_start(problem, data, z)
     else:  # the rank of a symmetric machine may be larger there than at its nominal values
         check_count(problem, data, options, fit.deviation)
     unclosed = find_unclosed_poses(robot.with_values(values), data)

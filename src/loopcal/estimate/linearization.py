@@ -70,11 +70,6 @@ class Start(TrialBatch):
         change = deviation - self.deviation
         return self.nuisance + np.matmul(self.slope, change[..., None])[..., 0]
 
-    @property
-    def states(self) -> engine.State | None:
-        """States (t, n) with which poses begin; None to begin at home."""
-        return self.poses and self.poses.state
-
     def with_nuisance(self, values: FloatArray) -> Start:
         """Return this start with other nuisance parameters (t, U), which do not move."""
         values = np.broadcast_to(values, self.nuisance.shape)

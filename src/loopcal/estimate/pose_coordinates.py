@@ -341,9 +341,7 @@ def _linearize_freedoms(
 def _usable_rows(
     rows: Sequence[ObservationRows], pose: IntArray
 ) -> list[tuple[ObservationRows, IntArray]]:
-    """Return the kinds whose rows need nothing but a pose, and their rows (k, c) of k poses."""
-    if not len(pose):
-        return []
+    """Return the kinds whose rows need nothing but a pose, and their rows (k, c) of k > 0 poses."""
     usable = [
         r
         for r in rows

@@ -273,7 +273,7 @@ def find_unclosed_poses(robot: Mechanism, data: Measurements) -> UnclosedPoses:
     """Return the poses of measurements whose redundant readings do not close the loops of a robot.
 
     Poses with a missing reading are not tested, and robots with as many actuators as freedoms have
-    none: a pose that they do not reach is refused by `check_start`.
+    none: a pose that they do not reach is refused by `refuse_start`.
     """
     if robot.redundancy is None:
         return UnclosedPoses((), (), data.n_poses)

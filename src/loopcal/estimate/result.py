@@ -180,7 +180,6 @@ STATUS_CODES = {
     DescentStatus.CONVERGED: "fit.converged",
     DescentStatus.OUT_OF_ITERATIONS: "fit.out-of-iterations",
     DescentStatus.NO_DESCENT: "fit.no-descent",
-    DescentStatus.BAD_START: "fit.bad-start",
     DescentStatus.NO_PROGRESS: "fit.no-progress",
 }
 
@@ -296,9 +295,7 @@ class History:
     @property
     def finding(self) -> Finding:
         """How the iteration ended."""
-        has_steps = self.status is not DescentStatus.BAD_START
-        data: dict[str, Any] = {"iterations": self.iterations} if has_steps else {}
-        return report_finding(STATUS_CODES[self.status], **data)
+        return report_finding(STATUS_CODES[self.status], iterations=self.iterations)
 
     def __repr__(self) -> str:
         """Return the status and the number of iterations."""
@@ -844,7 +841,8 @@ def estimate_nuisance(
     noise: float,
     start: FloatArray | None = None,
 ) -> NuisanceEstimate:
-    """Return the nuisance parameters of one trial after a fit, linearized at the estimate.
+    """Return the nuisance parameters of one trial after a fit, linearized at the estimate, where
+    all residuals are finite.
 
     `variance` (p,) is that of each direction of the decomposition, `noise` that of the whitened
     rows; NaN where no interval is given. `start` (U,) fits the initial geometry; by default the fit
@@ -854,12 +852,7 @@ def estimate_nuisance(
     begin = linearization.next_start.first_nuisance[0] if start is None else start
     units = [choose_setup_unit(robot, entry) for entry in table.entries]
     shown = tuple((unit.factor_to_si, unit.symbol) for unit in units)
-    U, p = len(table), decomposition.directions.shape[1]
-    if linearization.nuisance is None or not np.isfinite(linearization.cost[0]):
-        estimate, nothing = linearization.next_start.nuisance[0].copy(), np.zeros(U)
-        unobservable = np.zeros(U, dtype=bool)
-        slope, root = np.zeros((U, p)), UnknownRoot.make_empty(U)
-        return NuisanceEstimate(table, begin, estimate, nothing, slope, root, unobservable, shown)
+    assert linearization.nuisance is not None
     done, is_free = linearization.nuisance.elimination, nuisance.is_free
     V = decomposition.directions[0]
     slope, is_unobservable, root = done.slope[0], done.is_unobservable[0], done.list_root()
@@ -874,7 +867,7 @@ def estimate_nuisance(
     count = int(is_free.sum() - done.rank[0])
     rotations = sum(freedom in ROTATION_AXES for freedom in robot.freedoms)
     lost = [*compress(table.entries, is_unobservable)]
-    square = np.zeros(U)
+    square = np.zeros(len(table))
     square[is_free] = np.where(
         is_infinite | is_unobservable[is_free],
         np.inf,

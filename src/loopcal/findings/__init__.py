@@ -99,7 +99,7 @@ def report_finding(code: str, severity: Severity | None = None, **data: Any) -> 
 
 # Codes of findings, most important first. Codes that are absent here come after these.
 IMPORTANCE = """
-fit.bad-start fit.no-descent fit.no-progress fit.out-of-iterations
+fit.no-descent fit.no-progress fit.out-of-iterations
 gates.poses-unreachable gates.errors-grew
 noise.residuals-too-large residuals.frame-moved residuals.base-targets-moved
 conformity.fails gates.limit-exceeded gates.limit-not-measured conformity.undecided
