@@ -37,7 +37,7 @@ from loopcal.errors import LoopcalError
 from loopcal.estimate.elimination import NodeRows, fold_node_rows
 from loopcal.estimate.fit_descent import estimate_scale_of
 from loopcal.estimate.fit_linearization import FitUncertainty
-from loopcal.estimate.free_parameters import FreeParameters
+from loopcal.estimate.free_parameters import fix_all
 from loopcal.estimate.observation_rows import linked_blocks, list_block_labels
 from loopcal.estimate.problem import problem_of
 from loopcal.estimate.residual_test import FALSE_ALARMS
@@ -222,11 +222,7 @@ class Predictor(NamedTuple):
         """Yield blocks as `iterate_blocks`, in standard deviations of the noise; `member` (n,) is
         the block of each pose.
         """
-        if self.uncertainty is None:
-            nothing = np.zeros(0)
-            free = FreeParameters(self.robot, nothing.astype(int), nothing, nothing, nothing > 0.0)
-        else:
-            free = self.uncertainty.free
+        free = fix_all(self.robot) if self.uncertainty is None else self.uncertainty.free
         problem, table = problem_of(free, data), data.nuisance_parameters.table
         z = free.deviation(self.robot.values[None])
         values = np.array([[self.values[name] for name in table.names]]).reshape(1, -1)

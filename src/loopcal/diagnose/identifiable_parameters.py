@@ -38,7 +38,7 @@ from loopcal.estimate.information import (
     instrument_factor,
     observe_poses,
 )
-from loopcal.estimate.pose_estimate import find_unclosed_poses
+from loopcal.estimate.pose_estimate import find_unclosed_poses, refuse_unreached
 from loopcal.estimate.posterior import Posterior, compute_posterior
 from loopcal.estimate.prior_inflation import restate
 from loopcal.findings import Finding, report_finding
@@ -363,13 +363,7 @@ def identifiability(
     if unclosed.are_most:
         raise EstimationError(unclosed.report("fit.poses-open"))
     factor, reached = collect_information(free, data)
-    if not reached.all():
-        names = tuple(data.labels[i] for i in np.flatnonzero(~reached))
-        raise EstimationError(
-            report_finding(
-                "fit.poses-out-of-reach", count=len(names), total=data.n_poses, poses=names
-            )
-        )
+    refuse_unreached(data, np.flatnonzero(~reached))
     decomposition = decompose(factor, np.full(1, count), tolerance=rank_tolerance)
     rows = factor[0, :-1, :-1]
     s, V = decomposition.singular_values[0], decomposition.directions[0]

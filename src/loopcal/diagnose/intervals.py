@@ -75,8 +75,6 @@ def fit_tail_shape(weight: FloatArray) -> float:
     """
     total = len(weight)
     count = int(min(LARGEST_TAIL * total, 3.0 * np.sqrt(total)))
-    if count < 5:
-        return np.nan
     ordered = np.sort(weight)
     x = ordered[-count:] - ordered[-count - 1]
     x = x[x > 0.0]
@@ -156,9 +154,7 @@ class Intervals(TableResult):
     @property
     def is_off(self) -> BoolArray:
         """(p,) whether the linear interval is off by more than `OFF`, beyond the random draws."""
-        tested = int(np.isfinite(self.shift).sum())
-        if not tested:
-            return np.zeros(len(self.names), dtype=bool)
+        tested = max(int(np.isfinite(self.shift).sum()), 1)
         quantile = float(coverage_factor(np.inf, 1.0 - compute_single_level(FALSE_ALARMS, tested)))
         beyond = np.abs(self.shift) - quantile * self.shift_error
         return np.asarray((np.where(np.isnan(beyond), 0.0, beyond) > OFF).any(axis=0))

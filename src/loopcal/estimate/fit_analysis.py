@@ -20,7 +20,12 @@ from loopcal.estimate.fit_descent import (
     get_method,
     report_closure_start,
 )
-from loopcal.estimate.free_parameters import Combination, FreeParameters, describe_null_space
+from loopcal.estimate.free_parameters import (
+    Combination,
+    FreeParameters,
+    describe_null_space,
+    fix_all,
+)
 from loopcal.estimate.information import FrameRows, UnfixedMotions, describe_frames
 from loopcal.estimate.linearization import Linearization, PoseEstimates
 from loopcal.estimate.observation_rows import Residuals, linked_blocks
@@ -363,10 +368,8 @@ def fit_setup_alone(
     reached_setup = reached_data.nuisance_parameters
     entries = {entry.name: entry for entry in table.entries}
     stated = ParameterTable(tuple(entries[name] for name in reached_setup.table.names))
-    nothing = np.zeros(0)
-    fixed = FreeParameters(robot, nothing.astype(np.int64), nothing, nothing, nothing.astype(bool))
-    setup, z = replace(reached_setup, table=stated), nothing[None]
-    problem = problem_of(fixed, reached_data, setup)
+    setup, z = replace(reached_setup, table=stated), np.zeros((1, 0))
+    problem = problem_of(fix_all(robot), reached_data, setup)
     try:
         fitted = problem.solve(z, problem.start(z)).nuisance
     except DataError:  # too few rows for a closed form

@@ -160,6 +160,12 @@ def select_free_parameters(robot: Mechanism) -> FreeParameters:
     return FreeParameters(robot, places, table.nominal[places], tolerance, assumed, correlation)
 
 
+def fix_all(robot: Mechanism) -> FreeParameters:
+    """Return no free parameter: the robot as it is, for fits of poses and setup alone."""
+    nothing = np.zeros(0)
+    return FreeParameters(robot, nothing.astype(np.int64), nothing, nothing, nothing > 0.0)
+
+
 def free_only(robot: Mechanism, names: Iterable[str]) -> Mechanism:
     """Return the robot with only these parameters free."""
     return replace(robot, parameters=robot.parameters.with_free(names))

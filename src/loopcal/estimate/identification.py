@@ -32,7 +32,7 @@ from loopcal.estimate.linearization import PoseSolution, Start, linearize_rows
 from loopcal.estimate.losses import Loss
 from loopcal.estimate.options import FitOptions, merge_options
 from loopcal.estimate.penalties import MAP, LeastSquares, Method, adapt_method, fix_penalty
-from loopcal.estimate.pose_estimate import find_unclosed_poses
+from loopcal.estimate.pose_estimate import find_unclosed_poses, refuse_unreached
 from loopcal.estimate.posterior import Posterior, VarianceSources, compute_posterior
 from loopcal.estimate.prior import refuse_reused_rows
 from loopcal.estimate.problem import Problem, problem_of, problem_of_trials
@@ -137,16 +137,7 @@ def check_count(problem: Problem, data: Measurements, options: FitOptions, z: Fl
 def refuse_start(problem: Problem, data: Measurements, deviation: FloatArray) -> NoReturn:
     """Refuse a start at which some residuals are not finite, with the poses."""
     start = problem.start(deviation)
-    lost = problem.poses.find_unreached(deviation, start)
-    if len(lost) > 0:
-        raise EstimationError(
-            report_finding(
-                "fit.poses-out-of-reach",
-                count=len(lost),
-                total=data.n_poses,
-                poses=tuple(data.labels[i] for i in lost),
-            )
-        )
+    refuse_unreached(data, problem.poses.find_unreached(deviation, start))
     with np.errstate(all="ignore"):
         residuals = problem.residuals(deviation, problem.solve(deviation, start))
     bad = {

@@ -15,7 +15,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from loopcal.estimate.free_parameters import FreeParameters
+from loopcal.errors import EstimationError
+from loopcal.estimate.free_parameters import fix_all
 from loopcal.estimate.linearization import PoseEstimates
 from loopcal.estimate.problem import Problem, problem_of
 from loopcal.findings import Finding, Quantity, report_finding
@@ -218,12 +219,11 @@ def fit_poses(
     Of `nuisance` those without fixed values are fitted as well. None leaves the rows out: readings
     alone locate the poses. Raises DataError where a redundant reading is stated to be exact.
     """
-    data, nothing = fill_in_reading_sigma(robot, data), np.zeros(0)
+    data = fill_in_reading_sigma(robot, data)
     if nuisance is None:
         data = replace(data, observations=())
         nuisance = NuisanceParameters(ParameterTable(()), ())
-    free = FreeParameters(robot, nothing.astype(np.int64), nothing, nothing, nothing.astype(bool))
-    problem, z = problem_of(free, data, nuisance), np.zeros((1, 0))
+    problem, z = problem_of(fix_all(robot), data, nuisance), np.zeros((1, 0))
     fitted = problem.solve(z, problem.start(z))
     estimates = fitted.estimates
     assert estimates is not None
@@ -240,6 +240,14 @@ def fit_poses(
         (problem.poses.component_count[0] - estimates.rank[0])[member],
         problem.residuals(z, fitted)[-1].whitened[0],
     )
+
+
+def refuse_unreached(data: Measurements, lost: IntArray) -> None:
+    """Refuse measurements with poses (k,) that a robot does not reach, if there are any."""
+    if len(lost):
+        names, total = tuple(data.labels[i] for i in lost), data.n_poses
+        found = {"count": len(names), "total": total, "poses": names}
+        raise EstimationError(report_finding("fit.poses-out-of-reach", **found))
 
 
 MOST = 0.5

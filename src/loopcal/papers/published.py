@@ -526,8 +526,6 @@ def choose_styles(figures: Sequence[Figure]) -> dict[str, dict[str, Any]]:
 
 def draw(figure: Figure, styles: Mapping[str, Mapping[str, Any]]) -> Canvas:
     """Draw a figure with its legend below the axes; styles : see `choose_styles`."""
-    from matplotlib.ticker import MaxNLocator
-
     from loopcal.report.figures import style
 
     canvas = style.start_figure(7.2, 4.6)
@@ -551,8 +549,7 @@ def draw(figure: Figure, styles: Mapping[str, Mapping[str, Any]]) -> Canvas:
     axes.set_xscale("log" if "x" in figure.log else "linear")
     axes.set_yscale("log" if "y" in figure.log else "linear")
     if "x" not in figure.log and all(x.is_integer() for s in figure.series for x in s.x):
-        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+        style.label_sparsely(axes.xaxis)
     style.label_axes(axes, figure.x_label, figure.y_label)
     style.add_legend(canvas, handles)
-    canvas.suptitle(figure.title, fontsize=style.TITLE)
-    return canvas
+    return style.finish_figure(canvas, figure.title)
