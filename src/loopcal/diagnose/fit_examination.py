@@ -367,14 +367,9 @@ class StoredAnswer(Result):
     moved: tuple[tuple[str, float, float, str], ...]
 
     @property
-    def is_optimum(self) -> bool:
-        """Whether the optimum is no better, except for the decimals of a file."""
-        return self.stored - self.best <= NO_GAIN * self.stored
-
-    @property
     def finding(self) -> Finding:
         """The comparison as a finding."""
-        if self.is_optimum:
+        if self.stored - self.best <= NO_GAIN * self.stored:  # the decimals of a file
             return report_finding("residuals.stored-is-optimum", stored=self.stored, best=self.best)
         return report_finding("residuals.stored-not-optimum", **vars(self))
 

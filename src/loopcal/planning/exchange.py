@@ -111,7 +111,10 @@ def _solve(
 
     def measure(w: FloatArray) -> tuple[FloatArray, float, float]:
         """Return the slopes at weights, their score, and the bound that follows."""
-        d, d0, score = _slopes(scoring, scaled, w)
+        R = _factor(scoring, scaled, w)
+        columns, score = find_slope_columns(scoring, R), scoring.score(R)
+        d = compute_slopes(scaled, columns)
+        d0 = float(compute_slopes(scoring.prior_rows[None], columns)[0])  # by the prior's weight
         most = n * d.max() if repeats else np.partition(d, N - n)[N - n :].sum()
         return d, score, score + scoring.height * float(np.log((d0 + most) / scoring.height))
 
@@ -162,16 +165,6 @@ def _factor(scoring: Scoring, scaled: FloatArray, w: FloatArray) -> FloatArray:
     """Return R of the prior and groups with weights w (N,)."""
     used = w > 0.0
     return scoring.factor(np.sqrt(w[used])[:, None, None] * scaled[used])
-
-
-def _slopes(scoring: Scoring, scaled: FloatArray, w: FloatArray) -> tuple[FloatArray, float, float]:
-    """Return derivatives d (N,) of the score by the weights, d_0 by a multiple of the prior, and
-    the score.
-    """
-    R = _factor(scoring, scaled, w)
-    columns = find_slope_columns(scoring, R)
-    d0 = float(compute_slopes(scoring.prior_rows[None], columns)[0])
-    return compute_slopes(scaled, columns), d0, scoring.score(R)
 
 
 def _maximize_weights(

@@ -285,8 +285,11 @@ def _place(T: np.ndarray, units: Units) -> tuple[str, ...]:
 def _unit_of_term(robot: Mechanism, owner: str, term: str, units: Units) -> tuple[float, str]:
     """Return factor to SI and symbol of a term of a transmission, or of a weight of a sum."""
     length, angle = units[Dimension.LENGTH], units[Dimension.ANGLE]
-    if term.startswith(WEIGHT):
-        is_radius = _is_radius(robot, owner, term.removeprefix(WEIGHT))
+    if term.startswith(WEIGHT):  # a length per radian: that of an angle in a sum of lengths
+        joints = (joint for limb in robot.assembly.limbs for joint in limb.joints)
+        turning = {joint.actuator for joint in joints if joint.kind == "R"}
+        is_length = _joint_dimension(robot, owner) is Dimension.LENGTH
+        is_radius = is_length and term.removeprefix(WEIGHT) in turning
         return (length.factor_to_si, f"{length}/rad") if is_radius else (1.0, "1")
     if term in ("skew.x", "skew.y"):
         return angle.factor_to_si, angle.symbol
@@ -316,12 +319,6 @@ def _find_reading(robot: Mechanism, name: str, term: str = "") -> Dimension:
     row = next(row for row in robot.assembly.rows if row.name == name)
     column = LOAD + name if term == "compliance" else row.column
     return next((a.dimension for a in robot.actuators if a.name == column), row.dimension)
-
-
-def _is_radius(robot: Mechanism, name: str, joint: str) -> bool:
-    """Return whether a weight is a length per radian: that of an angle in a sum of lengths."""
-    turning = {j.actuator for limb in robot.assembly.limbs for j in limb.joints if j.kind == "R"}
-    return joint in turning and _joint_dimension(robot, name) is Dimension.LENGTH
 
 
 def _joint_dimension(robot: Mechanism, name: str) -> Dimension:

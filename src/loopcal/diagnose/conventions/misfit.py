@@ -692,7 +692,7 @@ def shares_poses(data: Measurements) -> bool:
 def _test(
     listed: Sequence[Interpretation],
     screened: FloatArray,
-    judge: Callable[[IntArray], FloatArray | list[float]],
+    judge: Callable[[list[Interpretation]], FloatArray | list[float]],
     misfit: float,
 ) -> list[_Test]:
     """Return the tests of interpretations with misfits by a few rows: `judge` computes the misfits
@@ -702,7 +702,7 @@ def _test(
     bound = min(PROMISING * misfit / BETTER, *finite[MOST_JUDGED - 1 : MOST_JUDGED], np.inf)
     promising = np.flatnonzero((screened <= bound) & np.isfinite(screened))
     judged = np.full(len(listed), np.inf)
-    judged[promising] = judge(promising)
+    judged[promising] = judge([listed[i] for i in promising.tolist()])
     numbers = (np.nan_to_num(misfits, nan=np.inf).tolist() for misfits in (screened, judged))
     return [_Test(*row) for row in zip(listed, *numbers, strict=True)]
 
@@ -731,12 +731,9 @@ class _Search(NamedTuple):
         tests: list[_Test] = []
         if reached is not None:
             of_values, few = list(list_interpretations(reached)), reached.take(_select_few(reached))
-
-            def judge_values(promising: IntArray) -> FloatArray:
-                return compute_misfits(free, reached, [of_values[i] for i in promising], THOROUGH)
-
             screened = compute_misfits(free, few, of_values, QUICK)
-            tests = _test(of_values, screened, judge_values, misfit)
+            judge = partial(compute_misfits, free, reached, effort=THOROUGH)
+            tests = _test(of_values, screened, judge, misfit)
         robot, poses = free.robot, _select_few(data)
         home = compute_readings(robot, robot.values[None], robot.home_state)[0, 0]
         listed = list(list_reading_interpretations(data, robot.actuators, home))
@@ -746,11 +743,9 @@ class _Search(NamedTuple):
         for i in np.sort(np.argsort(size, kind="stable")[:nearest]).tolist():
             few = listed[near[i]].apply(data).take(poses)
             screened[near[i]] = self.judge(few, QUICK, start[[i]])
-
-        def judge_readings(promising: IntArray) -> list[float]:
-            return [self.judge(listed[i].apply(data)) for i in promising]
-
-        return tests + _test(listed, screened, judge_readings, misfit)
+        return tests + _test(
+            listed, screened, lambda some: [self.judge(each.apply(data)) for each in some], misfit
+        )
 
     def test_parameters(self) -> list[_Test]:
         """Test interpretations that have parameters of their own: setup items that are not declared
@@ -759,8 +754,8 @@ class _Search(NamedTuple):
         free, written, reached, misfit = self
 
         def test_each(listed: Sequence[Interpretation], data: Measurements) -> list[_Test]:
-            def judge(promising: IntArray) -> list[float]:
-                judged = [judge_data(free, listed[i].apply(data)) for i in promising]
+            def judge(chosen: list[Interpretation]) -> list[float]:
+                judged = [judge_data(free, each.apply(data)) for each in chosen]
                 return [np.inf if each is None else refine_misfit(each)[0] for each in judged]
 
             few = _select_few(data)
