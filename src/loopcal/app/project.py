@@ -368,9 +368,7 @@ class Project:
     # Measuring
 
     def measure(self) -> dict[str, list[str]]:
-        """Measure the poses of the plan or of a given sheet, or go on with it; first the program's
-        file is to be read.
-        """
+        """Measure the poses of a plan or sheet, or go on; a program's file is to be read first."""
         import loopcal as lc
 
         sheets = [name for name in (SHEET, *self.list_files("data")) if self.has(name)]

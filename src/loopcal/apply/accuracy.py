@@ -344,9 +344,7 @@ class AccuracyMap(DrawnResult):
 
     @property
     def position_ratio(self) -> FloatArray:
-        """(n,) position uncertainty over the largest at the measured poses; above 1 the map
-        extrapolates.
-        """
+        """(n,) position uncertainty divided by the largest at the measured poses."""
         return _ratio(self.uncertainty.position, self.measured.position)
 
     @property
@@ -518,9 +516,7 @@ def simulate_accuracy(
 def _compare_with_truth(
     fits: IdentifiedTrials, trials: Trials, readings: FloatArray, start: State | None = None
 ) -> tuple[BoolArray, FloatArray]:
-    """Return which trials (t,) have a fit and all poses at readings (n, a), and the errors (t, n,
-    6) of these poses.
-    """
+    """Return which trials (t,) have a fit and all poses at readings, and their errors (t, n, 6)."""
     states = [
         forward_trials(fits.free_parameters.robot, values, readings[None], start)
         for values in (fits.values, trials.truth)

@@ -334,9 +334,7 @@ def _use_map(posterior: Posterior | None) -> tuple[Finding, Posterior]:
 
 
 def _correct(posterior: Posterior | None, solution: Solution) -> FloatArray | None:
-    """Return the twists (n, 6) by which the map of the residuals corrects solved poses; None
-    without a map.
-    """
+    """Return the twists (n, 6) by which the map corrects solved poses; None without a map."""
     if posterior is None or (own := posterior.discrepancy) is None or not own.is_corrected:
         return None
     robot = posterior.robot

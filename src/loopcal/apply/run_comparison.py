@@ -408,9 +408,7 @@ def _relate_data(first: Run, second: Run) -> tuple[str, int, int]:
 
 
 def _find_row_noise(run: Run) -> dict[str, FloatArray]:
-    """Return the standard deviation of the measured values of each kind [SI], from its residuals
-    and these divided by it.
-    """
+    """Return the noise of each kind [SI]: the median of residuals divided by whitened ones."""
     result = {}
     for name, raw in run.arrays.items():
         if not name.startswith("residual_"):

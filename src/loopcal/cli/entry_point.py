@@ -218,9 +218,7 @@ def _report(
     words: Sequence[str],
     outputs: Sequence[Path],
 ) -> int:
-    """Print what an exception means for the user; return the exit code. `outputs` were written
-    completely before it.
-    """
+    """Print what an exception means; return the exit code. `outputs` were complete before it."""
     if outputs:
         names = " and ".join(str(path) for path in outputs)
         terminal.print_message(f"loopcal: written completely before the following: {names}")

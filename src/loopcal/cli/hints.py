@@ -12,14 +12,12 @@ import shlex
 from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
 from loopcal.cli import terminal
-
-if TYPE_CHECKING:
-    from loopcal.findings import Finding
+from loopcal.findings import Finding
+from loopcal.findings.wording import add_advice
 
 
 @cache
@@ -90,8 +88,6 @@ def suggest_command(*words: object) -> str:
 
 def with_hint(finding: Finding) -> str:
     """Return the text of a finding, with the hint for the command that runs."""
-    from loopcal.findings.wording import add_advice
-
     return add_advice(finding, hint_for(finding))
 
 

@@ -58,9 +58,7 @@ class Dialog(MeasuringSession):
         return False
 
     def _list_inputs(self) -> Iterator[str | Row]:
-        """Give typed lines and rows of the export as they come; without an export until the input
-        ends.
-        """
+        """Give typed lines, until they end, and rows of the export, if any, as they come."""
         lines: queue.Queue[str | None] = queue.Queue()
 
         def read() -> None:

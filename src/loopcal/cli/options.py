@@ -790,9 +790,7 @@ def _place_camera(robot: lc.Mechanism, file: Path | None, options: lc.PlanOption
 
 
 def _print_assumed_sigma(instrument: lc.Instrument) -> None:
-    """Print a note where the user states the noise of lengths or of angles, and the instrument
-    measures both.
-    """
+    """Print a note where one noise is stated, of lengths or angles, and both are measured."""
     from loopcal.measure.instrument import SIGMA
     from loopcal.results.tables import to_quantity
 

@@ -22,10 +22,10 @@ from typing import TYPE_CHECKING, Any, Self, TextIO
 import click
 
 from loopcal.errors import FileError
+from loopcal.findings import Finding, report_finding
 from loopcal.plain_text import escape
 
 if TYPE_CHECKING:
-    from loopcal.findings import Finding
     from loopcal.results.tables import Block
 
 FORMAT = 1  # of the documents that --json prints and no file holds: output.schema.json
@@ -112,9 +112,7 @@ def flush_output() -> None:
 
 @contextmanager
 def _report_output_errors() -> Iterator[None]:
-    """Raise FileError where standard output cannot be written, and keep Python from trying again
-    when it exits.
-    """
+    """Raise FileError where standard output cannot be written; Python does not try again."""
     try:
         yield
     except OSError as error:
@@ -181,8 +179,6 @@ def print_note(text: object) -> None:
 
 def print_finding(code: str, **facts: Any) -> None:
     """Print the finding of a code as a note on standard error, once; --json contains it, too."""
-    from loopcal.findings import report_finding
-
     finding, printed = report_finding(code, **facts), list_printed()
     if finding not in printed:
         printed.append(finding)

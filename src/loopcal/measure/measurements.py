@@ -244,9 +244,7 @@ class Measurements(TableResult):
 
     @property
     def context(self) -> Mapping[str, FloatArray]:
-        """Time [s] and temperatures [degC] by name, (n,): the mean over the rows of a pose, NaN
-        where no row states one.
-        """
+        """Time [s] and temperatures [degC] (n,) by name: means of the rows of a pose, or NaN."""
         means: dict[str, FloatArray] = {}
         for name in dict.fromkeys(name for rows in self.observations for name in rows.context):
             total, count = np.zeros(self.n_poses), np.zeros(self.n_poses)

@@ -105,9 +105,7 @@ class NuisanceParameters:
         return values
 
     def with_prior(self, pattern: str, sd: float) -> Self:
-        """Return a copy with a prior of this standard deviation [SI] on parameters such as
-        `tracker.*`.
-        """
+        """Return a copy with a prior of this `sd` [SI] on parameters such as `tracker.*`."""
         if not is_sd(sd):
             raise DataError(
                 f"the standard deviation of {pattern!r} is {sd}. Give a number above 0, or fix the "

@@ -541,9 +541,7 @@ def _command(
 
 
 def _place_surfaces(sheet: Measurements, T: FloatArray) -> FloatArray:
-    """Return the values (U,) of unknown surfaces: parallel to the stated ones, through the first
-    point of each group.
-    """
+    """Return values (U,) of unknown surfaces, moved parallel to the first point of each group."""
     nuisance = sheet.nuisance_parameters
     values = nuisance.values()
     rows = evaluate_measurements(sheet, T[None], values[None], nuisance)
@@ -560,9 +558,7 @@ def _place_surfaces(sheet: Measurements, T: FloatArray) -> FloatArray:
 def _correct_positions(
     sheet: Measurements, rows: tuple[EvaluatedRows, ...], noise: list[FloatArray]
 ) -> tuple[FloatArray, float]:
-    """Return the smallest displacements (n, 3) [m] that close the gaps up to their noise, and the
-    largest gap.
-    """
+    """Return the least shifts (n, 3) [m] that close the gaps up to noise, and the largest gap."""
     poses = np.concatenate([np.repeat(r.poses[:, 0], r.residual.shape[2]) for r in rows])
     along = np.concatenate([r.jacobian[0, :, 0, :, 3:].reshape(-1, 3) for r in rows])
     gaps = [r.residual[0] - drawn for r, drawn in zip(rows, noise, strict=True)]

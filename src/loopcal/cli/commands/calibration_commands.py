@@ -284,8 +284,7 @@ def check_up(
     from loopcal.io.core.text_file import write_bytes
     from loopcal.report.pictures import save_figure
 
-    if output is not None:
-        refuse_outputs((output,), (run, *checks), force)
+    refuse_outputs((output,), (run, *checks), force)
     calibrated = lc.load_run(run)
     data = {
         str(file): opt.read_checked_measurements(

@@ -18,6 +18,8 @@ from loopcal.cli import terminal
 from loopcal.cli.hints import suggest_command, with_hint
 from loopcal.cli.terminal import Output
 from loopcal.errors import DataError
+from loopcal.findings import report_finding
+from loopcal.findings.wording import name_count
 from loopcal.units import Dimension, find_unit, list_symbols
 
 if TYPE_CHECKING:
@@ -393,7 +395,6 @@ def convert_instrument_export(
 
     `local` : the unit of lengths in place of that of the profile, and whether commas are decimal.
     """
-    from loopcal.findings.wording import name_count
     from loopcal.io.core.outputs import refuse_outputs
     from loopcal.io.exports.conversion import convert_export, save_converted
     from loopcal.io.exports.profile import find_profile_file, read_profile, with_local_settings
@@ -535,7 +536,6 @@ def import_(
     """
     from loopcal.apply.base_motion import choose_base
     from loopcal.diagnose.fit_examination import compare_stored_geometry
-    from loopcal.findings import report_finding
     from loopcal.io.core.limits import make_name
     from loopcal.io.core.outputs import refuse_outputs, restore_on_failure
     from loopcal.io.core.text_file import write_text
@@ -618,7 +618,6 @@ def _view_import(
     robot: lc.Mechanism, document: Mapping[str, Any], noted: Sequence[lc.Finding]
 ) -> list[Block]:
     """Return what was read, what was identified, and which lines were changed."""
-    from loopcal.findings.wording import name_count
     from loopcal.report.calibration_view import view_fit
 
     n, free = len(robot.parameters), int(robot.parameters.free.sum())

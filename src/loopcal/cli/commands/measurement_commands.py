@@ -119,9 +119,7 @@ def identifiability(
 
 
 def _read_poses(poses: Path | None, draw: int, robot: lc.Mechanism) -> dict[str, Any]:
-    """Return the arguments `poses`, `labels` and `places` of a simulation: those of a file, or how
-    many to draw.
-    """
+    """Return the poses that a simulation is given: those of a file, or how many to draw."""
     from loopcal.io.data.measurement_file import load_pose_names, load_poses
 
     if poses is None:

@@ -278,9 +278,7 @@ NEEDED: Mapping[type, tuple[tuple[type, ...], str, str]] = {
 
 
 def _require(needed: Any, node: Any, at: Location, details: str = "") -> Any:
-    """Return a node of the type that is needed; a whole number as a float where that is needed.
-    `details` end what to do.
-    """
+    """Return a node of the needed type; an integer as a needed float. `details` end what to do."""
     allowed, words, act = NEEDED[needed]
     if isinstance(node, allowed) and (needed is bool or not isinstance(node, bool)):
         return float(node) if needed is float else node

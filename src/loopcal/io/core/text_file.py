@@ -269,8 +269,10 @@ def list_leftovers(target: Path, state: str | None = None) -> list[Path]:
         for entry in entries:
             match = _LEFTOVER.fullmatch(entry.name)
             if match and match[2] == name and state in (None, match[1]):
-                leftovers.append(Path(entry.path))
-    return sorted(leftovers, key=lambda path: (_read_time(path), path.name))
+                with suppress(OSError):  # it disappears meanwhile
+                    changed = entry.stat(follow_symlinks=False).st_mtime_ns
+                    leftovers.append((changed, entry.name))
+    return [target.with_name(of) for _, of in sorted(leftovers)]
 
 
 def remove_leftovers(target: Path, is_own: Callable[[Path], bool]) -> None:
@@ -317,14 +319,6 @@ def _name_beside(target: Path, state: str) -> Path:
 def _shorten(name: str) -> str:
     """Return the end of a file name, which includes its suffix."""
     return os.fsdecode(os.fsencode(name)[-_NAME_BYTES:])
-
-
-def _read_time(path: Path) -> int:
-    """Return when a file or folder was changed last."""
-    try:
-        return path.lstat().st_mtime_ns
-    except OSError:
-        return 0
 
 
 # Text and JSON files.
@@ -539,7 +533,7 @@ def _reason(error: OSError) -> str:
 # JSON text without NaN.
 
 PIECES = 10_000  # pieces of JSON text, such as a number, that are put together at once
-LONGEST_WHOLE = 400  # digits of a whole number that are read; a double has 309
+LONGEST_WHOLE = 308  # digits of a whole number that always fits a double
 
 
 def to_json(document: Mapping[str, Any]) -> str:
@@ -579,11 +573,9 @@ def read_json(path: str | Path, what: str, action: str, limit: FileLimit = PROGR
     try:
         content = json.loads(
             text,
-            parse_float=lambda number: _refuse_infinite(float(number), number),
-            parse_int=lambda number: _refuse_infinite(
-                int(number) if len(number) <= LONGEST_WHOLE else math.inf, number
-            ),
-            parse_constant=lambda name: _refuse_infinite(math.nan, name),
+            parse_float=_parse_finite,
+            parse_int=lambda text: (int if len(text) <= LONGEST_WHOLE else _parse_finite)(text),
+            parse_constant=_parse_finite,
             object_pairs_hook=_refuse_duplicates,
         )
     except json.JSONDecodeError as error:
@@ -601,17 +593,13 @@ def read_json(path: str | Path, what: str, action: str, limit: FileLimit = PROGR
     return content
 
 
-def _refuse_infinite(value: float, text: str) -> float:
-    """Return a number that fits a double."""
-    try:
-        is_finite = math.isfinite(float(value))
-    except OverflowError:
-        is_finite = False
-    if not is_finite:
-        if len(text) > 20:
-            raise ValueError(f"the number {text[:20]}… is too large")
-        raise ValueError(f"the number {text} is not finite")
-    return value
+def _parse_finite(text: str) -> float:
+    """Return the double of a number in a JSON text; ValueError where it is not finite."""
+    if math.isfinite(value := float(text)):
+        return value
+    if len(text) > 20:
+        raise ValueError(f"the number {text[:20]}… is too large")
+    raise ValueError(f"the number {text} is not finite")
 
 
 def _refuse_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

@@ -878,14 +878,12 @@ def format_data_sheet(
     """
     sensors = instrument.with_tool(robot).sensors
     rows = []
-    for sensor in (sensor.assign_rows(len(np.asarray(readings))) for sensor in sensors):
-        if sensor.rows is None:
-            continue
-        empty = np.full((len(sensor.rows), len(sensor.kind.columns)), np.nan)
+    readings = np.asarray(readings)
+    for sensor in (sensor.assign_rows(len(readings)) for sensor in sensors):
+        empty = np.full((len(sensor.assigned_rows), len(sensor.kind.columns)), np.nan)
         empty[:, : sensor.kind.label_count] = sensor.kind.list_labels(len(empty))
         names = (sensor.noise.sigma, sensor.session, sensor.group, sensor.noise.sight)
-        rows.append(Observations.from_sigma(sensor.kind, sensor.rows, empty, *names))
-    readings = np.asarray(readings)
+        rows.append(Observations.from_sigma(sensor.kind, sensor.assigned_rows, empty, *names))
     is_empty = np.isnan(readings)
     data = Measurements(
         robot.name,

@@ -654,9 +654,7 @@ def read_points(
     misfits: list[tuple[str, int, str]],
     content: bytes | None = None,
 ) -> tuple[Mapping[str, str | None], list[Row]]:
-    """Return the units of the columns of an export, or of its `content` so far, and its rows; add
-    its misfits.
-    """
+    """Return the units of the columns of an export or its `content`, and rows; add misfits."""
     kind, record = entry.kind, replace(profile.record, settings={})
     targets = tuple(getattr(kind, "targets", ()))
     if by_order:

@@ -464,9 +464,7 @@ class Run(Result):
 
     @property
     def fitted_rows(self) -> FittedRows | None:
-        """The rows that the run, and those that are its prior, were fitted to; None for a robot
-        file.
-        """
+        """The rows that the run and those of its prior were fitted to; None for a robot file."""
         return fitted_rows_from_arrays(self.arrays)
 
     @property

@@ -90,15 +90,6 @@ class DirectionKind(Kind):
         return d, self.join_columns(blocks, d.shape)
 
     @abstractmethod
-    def predict(self, d: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the columns (.., m) of directions d (.., 3), and their derivatives (.., m, 3)."""
-
-    def _predict(self, T: FloatArray, values: FloatArray, joints: FloatArray) -> Evaluation:
-        d, rows = self.locate_direction(T, values)
-        predicted, slopes = self.predict(d)
-        return self.split_columns(predicted, slopes @ rows)
-
-    @abstractmethod
     def convert_to_directions(self, measured: FloatArray) -> tuple[FloatArray, ...]:
         """Return the unit vectors d (.., 3) that columns (.., c) can stand for, usually one."""
 
@@ -201,10 +192,6 @@ class Direction(AxisKind):
         invalid = list_rows(is_incomplete(measured), lambda _: incomplete)
         return invalid + list_not_unit(measured, "direction")
 
-    def predict(self, d: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the direction itself."""
-        return d, np.eye(3)
-
     def convert_to_directions(self, measured: FloatArray) -> tuple[FloatArray, ...]:
         """Return the columns, scaled to length one."""
         return (measured / np.linalg.norm(measured, axis=-1, keepdims=True),)
@@ -277,15 +264,16 @@ class Inclination(DirectionKind):
         """Mounting and vertical."""
         return self.sensor, self.T_platform_sensor[:3, :3], "gravity", self.up
 
-    def predict(self, d: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _predict(self, T: FloatArray, values: FloatArray, joints: FloatArray) -> Evaluation:
         """Return both elevations."""
+        d, rows = self.locate_direction(T, values)
         x, y, z = d[..., 0], d[..., 1], d[..., 2]
         level_x, level_y = np.sqrt(y * y + z * z), np.sqrt(x * x + z * z)
         angles = np.stack([np.arctan2(x, level_x), np.arctan2(y, level_y)], axis=-1)
         # d has length one
         first = np.stack([level_x, -x * y / level_x, -x * z / level_x], axis=-1)
         second = np.stack([-x * y / level_y, level_y, -y * z / level_y], axis=-1)
-        return angles, np.stack([first, second], axis=-2)
+        return self.split_columns(angles, np.stack([first, second], axis=-2) @ rows)
 
     def convert_to_directions(self, measured: FloatArray) -> tuple[FloatArray, ...]:
         """Return the vertical in an upright sensor; with an unknown mounting, also in one that
@@ -351,9 +339,11 @@ class Autocollimation(AxisKind):
         """Frame and mirror."""
         return self.frame, self.T_base_frame[:3, :3], self.mirror, self.normal
 
-    def predict(self, d: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _predict(self, T: FloatArray, values: FloatArray, joints: FloatArray) -> Evaluation:
         """Return both angles."""
-        return predict_camera_angles(d)
+        d, rows = self.locate_direction(T, values)
+        angles, slopes = predict_camera_angles(d)
+        return self.split_columns(angles, slopes @ rows)
 
     def convert_to_directions(self, measured: FloatArray) -> tuple[FloatArray, ...]:
         """Return the normals of two angles, towards the instrument."""

@@ -33,9 +33,7 @@ from loopcal.units import Dimension
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class LengthKind(TargetKind):
-    """A kind that measures one length above 0 for each target, with a common offset: the bias of a
-    session.
-    """
+    """A kind with one length above 0 for each target, and the offset of a session: its bias."""
 
     bias_item: ClassVar[str] = "offset"
 

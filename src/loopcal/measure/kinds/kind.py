@@ -379,9 +379,7 @@ class Kind(ABC):
         return {}
 
     def spread_sight_noise(self, measured: FloatArray) -> dict[str, FloatArray]:
-        """Return the covariances (.., m, m) of measured values (.., m) per variance of each
-        `sight_noise`.
-        """
+        """Return covariances (.., m, m) of values (.., m) per variance of each `sight_noise`."""
         return {}
 
     @cached_property

@@ -240,9 +240,7 @@ class Pose(ToolKind):
     def _measure(
         self, T: FloatArray, noise: FloatArray, values: FloatArray, joints: FloatArray
     ) -> FloatArray:
-        """Return the columns; the first three numbers of the noise are a rotation error, or are
-        added to the angles.
-        """
+        """Return the columns; the noise begins with a rotation error, or is added to the angles."""
         tool, _ = self.locate_tool(T, values)
         orientation = self.form.from_matrix(geometry.exp_so3(noise[..., :3]) @ tool[..., :3, :3])
         if self.form.angles:

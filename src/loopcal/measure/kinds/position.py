@@ -149,9 +149,7 @@ class TargetKind(Kind):
 
     @cached_property
     def divided(self) -> tuple[Kind, IntArray] | None:
-        """The kind of one unknown target: its place is a parameter, so that one kind stands for
-        all.
-        """
+        """The kind of one unknown target, whose place is a parameter: one kind for all targets."""
         if self.places is None or len(self.targets) == 1 or "targets" not in self.unknown:
             return None
         pairs = zip(self.targets, self.places, strict=True)

@@ -145,9 +145,7 @@ def linearize_direction(stated: FloatArray, values: FloatArray) -> FloatArray:
 
 
 def encode_direction(stated: FloatArray, direction: FloatArray) -> FloatArray:
-    """Return the values (.., 2) that rotate a stated direction (3,) to another one (.., 3), by the
-    smallest angle.
-    """
+    """Return values (.., 2) of the least rotation of a stated direction (3,) to others (.., 3)."""
     axis = np.cross(stated, direction)
     sine = np.linalg.norm(axis, axis=-1, keepdims=True)
     angle = np.arctan2(sine, (direction @ stated)[..., None])
