@@ -302,9 +302,7 @@ def expand_length(covariance: FloatArray, left: FloatArray) -> FloatArray:
 
 
 def transport(robot: Mechanism, T: FloatArray, axes: Axes, point: Point) -> FloatArray:
-    """Return (n, 6, 6) from twists of the platform origin in base axes to those of a point in other
-    axes.
-    """
+    """Return (n, 6, 6) from twists of the platform origin, in base axes, to those of `point`."""
     R = T[:, :3, :3]
     arm = R @ robot.tool[:3, 3] if point == "tool" else np.zeros((len(T), 3))
     return geometry.transport_matrix(arm, R.swapaxes(1, 2) if axes == "platform" else None)

@@ -235,8 +235,7 @@ def compensate(
     ------
     DataError : unknown mode, no step, no target or targets of another shape, another number of
         labels.
-    EstimationError : no such frame; or a map that is not known, or lowers no errors at held-out
-        regions.
+    EstimationError : no such frame; or a map that is unknown, or lowers no held-out errors.
     """
     check_choice("mode", mode, get_args(Mode), DataError)
     if steps < 1:
@@ -472,9 +471,7 @@ class _Machine(NamedTuple):
     corrected: list[int]
 
     def lead(self, targets: FloatArray, commands: FloatArray) -> FloatArray:
-        """Return how far (n, c) the robot stops from targets at commands (n, c), NaN where the
-        machine does not get to one.
-        """
+        """Return how far (n, c) the robot stops from targets at commands (n, c), NaN unreached."""
         led = inverse(self.controller, commands)
         readings = np.where(led.converged[:, None], led.q, np.nan)
         return self.stop(targets, readings[:, list_commanded(self.controller)])

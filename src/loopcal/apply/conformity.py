@@ -231,8 +231,7 @@ def judge_largest_error(
     covariance : (e, c, c) of their noise. limit : the upper limit.
     level : probability that the decision rule asks for.
     noise_scale : factor s on the standard deviations of the noise; above 1 it speaks against
-        nonconformity, but not for conformity. noise_degrees : of freedom of s; infinite where it
-        is known.
+        nonconformity, but not for conformity. noise_degrees : of freedom of s, or infinite.
 
     Raises
     ------
@@ -336,8 +335,7 @@ def report_conformity(
 def report_decision(quantity: str, result: Conformity, unit: Unit, **measured: Any) -> Finding:
     """Return the decision on a limit in words, its lengths in one unit.
 
-    measured : pose, target and size of the largest measured error; without any, the error is that
-        of a volume.
+    measured : pose, target and size of the largest measured error; empty for that of a volume.
     """
     if unit.dimension is Dimension.LENGTH:
         unit = result.choose_unit(unit)
@@ -501,8 +499,7 @@ def _weigh_scales(
     errors: FloatArray, noise: FloatArray, scale: float, degrees: float, spread: Spread
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, float]:
     """Return g pairs of noise and tau: variances (g, 1, e, c) and tau (g,), their posterior
-    probabilities (g,), of each error (g, k, e) those of the k `tails`, and the logarithm of the
-    evidence.
+    probabilities (g,), those (g, k, e) of the k `tails` of each error, and the log evidence.
 
     A first search finds where the density is, and a second one resolves it.
     """

@@ -92,9 +92,7 @@ class PairComparison:
         return f"<PairComparison: {self.finding}>"
 
     def find_shift(self, name: str) -> tuple[float, float, bool]:
-        """Return the shift of a parameter, its standard deviation [SI], and whether it is
-        significant; NaN where it is not tested.
-        """
+        """Return a parameter's shift, its sd [SI], and whether it is significant; NaN untested."""
         if name not in self.names:
             return math.nan, math.nan, False
         i = self.names.index(name)
@@ -391,9 +389,7 @@ def _read_errors(run: Run, poses: Sequence[str] | None = None) -> PoseErrors:
 
 
 def _relate_data(first: Run, second: Run) -> tuple[str, int, int]:
-    """Return whether two runs were fitted to common rows, as `PairComparison.data`, with the number
-    of common rows and of all.
-    """
+    """Return `PairComparison.data` of two runs, with the numbers of common rows and of all."""
     mine, theirs = first.fitted_rows, second.fitted_rows
     if mine is None or theirs is None:
         return "unknown", 0, 0

@@ -255,8 +255,7 @@ def place_targets(instrument: Instrument, robot: Mechanism) -> Instrument:
     """Return the instrument with assumed places of unknown targets that state none.
 
     Several targets are evenly on a circle around the tool, in the xy plane of the platform; its
-    radius is half of the robot's size, to two digits in the robot's unit of length. One target is
-    at the tool.
+    radius is half of the robot's size, to two digits in its unit. One target is at the tool.
     """
     unit = find_unit(robot.units[Dimension.LENGTH]).factor_to_si
     radius = float(f"{robot.size / 2.0 / unit:.2g}")

@@ -304,8 +304,7 @@ def validate(
 
     Raises
     ------
-    DataError : a limit below 0; the data belong to another robot, contain no row, or every pose is
-        unreachable.
+    DataError : a limit below 0; data of another robot or without rows, or no pose is reachable.
     """
     check_limit("limit_position", limit_position)
     check_limit("limit_angle", limit_angle)

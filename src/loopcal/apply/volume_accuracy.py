@@ -264,8 +264,7 @@ class VolumeAccuracy(Result):
     reference : point and frame to which the errors refer.
     conformity : of the largest error with a limit, if one is stated.
     findings : the statement in words, what restricts it, and the decision on the limit.
-    robot : the machine. bounds : (m,) of the error at each single point of the grid, NaN out of
-        reach [m].
+    robot : the machine. bounds : (m,) of the error at grid points [m], NaN out of reach.
     """
 
     volume: Volume
@@ -390,8 +389,7 @@ def _draw_errors(
     seed: int,
     solution: Solution,
 ) -> _DrawnErrors:
-    """Return errors of poses that the robot reaches; EstimationError where the data do not
-    determine them.
+    """Return errors of reached poses; EstimationError where the data do not determine them.
 
     is_list : whether the scatter of the readings is that of an approach to each pose; otherwise it
         is that of one approach to any.

@@ -157,8 +157,7 @@ def check_duplicates(
     Two copies of one measurement count as twice the information. True repeats differ by their
     noise. Rows of weight 0 and rows without a measured value repeat nothing.
 
-    places : place of each row of each of the observations, those of the base last, such as
-        `data.csv:12`.
+    places : of each row of each of the observations, those of the base last: `data.csv:12`.
     """
     if allow:
         return

@@ -309,8 +309,7 @@ def _refine_candidates(
     steps: int = STEPS,
 ) -> tuple[FloatArray, FloatArray]:
     """Return refined candidates (t, g, k, u) of groups for t sets of measured values (t, r, c) at
-    poses (t | 1, n, 4, 4), and their sums of squares (t, g, k); kept parameters keep their values
-    (t, g, u).
+    poses (t | 1, n, 4, 4), and their sums of squares (t, g, k); kept values (t, g, u) stay.
     """
     kind, t, (g, r) = rows.kind, len(measured), groups.rows.shape
 
@@ -381,9 +380,7 @@ def _refine_together(
     values: FloatArray,
     joints: Mapping[str, FloatArray] | None,
 ) -> FloatArray:
-    """Return values (U,) after a descent over all parameters and all rows, priors included, of one
-    cluster after the other.
-    """
+    """Return values (U,) after a descent over all rows and priors, one cluster after the other."""
     cluster, refined = _find_clusters(nuisance), values.copy()
     members = [cluster[used].max(axis=1, initial=-1) for used in nuisance.indices]
     for c in range(int(cluster.max(initial=-1)) + 1):

@@ -133,8 +133,7 @@ Distribution = Literal["normal", "uniform"]
 
 
 def make_random_stream(seed: Seed, trial: int, purpose: int = 0) -> np.random.Generator:
-    """Return the generator of one trial of a study, counted from 0: a function of these three
-    numbers only.
+    """Return the generator of one trial, counted from 0: a function of these three numbers only.
 
     purpose : separates what one trial draws: 0 noise, 1 true values, 2 noise of readings, 3
         effects, 4 errors of the readings of held-out poses, 5 setup parameters, 6

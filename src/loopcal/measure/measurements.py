@@ -332,8 +332,7 @@ class Measurements(TableResult):
         """Return the same measurements with one weight (n,) for each pose.
 
         A row that compares poses gets the product of their weights. Uncertain readings are weighted
-        like the rows of their pose: sigma / sqrt(weight). `Observations.with_weights` weights
-        single rows.
+        like those of their pose: sigma / sqrt(weight). `Observations.with_weights` : single rows.
 
         Raises
         ------
@@ -401,14 +400,12 @@ def choose_fitted(
     data: Measurements, hold_out: float, seed: int, regions: IntArray | None = None
 ) -> BoolArray:
     """Return which poses (n,) are fitted where a share is held out at random, by whole
-    `data.undivided` and whole regions (n,), if they are given; not by regions that link all poses
-    with each other.
+    `data.undivided` and whole regions (n,), if given; not by regions that link all poses.
 
     A session has a frame of its own, a surface its plane. Where too few of its poses are fitted,
     nobody can predict the others. Each frame, target, surface and offset that is estimated
     therefore keeps, in the order of the choice, poses with as many measured values as it has
-    parameters, and one pose more: three points for a frame, because two leave the rotation about
-    their line.
+    parameters, and one pose more: three points for a frame, as two leave a rotation about a line.
 
     Where the setup leaves less than half of the poses to hold out, sessions that need all of theirs
     are held out as a whole; where it leaves none then, it does not count. DataError where the poses

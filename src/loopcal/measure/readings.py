@@ -208,9 +208,7 @@ def resolve_reading_sigma(robot: Mechanism, given: FloatArray | None, n: int) ->
 
 
 def fill_in_reading_sigma(robot: Mechanism, data: Measurements) -> Measurements:
-    """Return measurements that contain the standard deviations that the robot states; the same
-    object where all readings are exact.
-    """
+    """Return measurements with the robot's standard deviations; the same if readings are exact."""
     sigma = resolve_reading_sigma(robot, data.reading_sigma, data.n_poses)
     is_same = sigma is None or sigma is data.reading_sigma
     return data if is_same else replace(data, reading_sigma=sigma)
@@ -239,8 +237,7 @@ def find_reading_tolerance(
 
     A controller records the readings of each visit of a pose with jitter of its own, so repeats
     seldom have equal readings. The tolerance of a reading is the share of its range that the noise
-    has of the range of the measured values: a change by it moves no measured value much beyond its
-    noise.
+    has of the range of measured values: it moves none of them much beyond its noise.
 
     readings : (n, a) [SI]. observations : with the noise of their rows. reading_sigma : (n, a)
         [SI] or None, of uncertain readings, which differ by it although the pose is the same.

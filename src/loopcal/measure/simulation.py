@@ -275,8 +275,7 @@ def simulate_trials(
 
     Raises
     ------
-    DataError : the controller cannot reach a pose, a setup parameter does not exist, or `truth` has
-        another shape.
+    DataError : a pose out of reach, an unknown setup parameter, or another shape of `truth`.
     """
     check_type(robot, Mechanism, "robot", "from loopcal.load_robot")
     check_type(instrument, Instrument, "instrument", "such as loopcal.Instrument((sensor,))")
@@ -374,9 +373,7 @@ def _draw_conditions(robot: Mechanism, readings: FloatArray, seed: Seed) -> Floa
 def _draw_setup(
     nuisance: NuisanceParameters, stated: Mapping[str, float], trials: int, seed: Seed
 ) -> FloatArray:
-    """Return true values (t | 1, U) of setup parameters, drawn from their priors where they have
-    one and no `stated` true value.
-    """
+    """Return true values (t | 1, U) of setup parameters: the `stated` ones, else of priors."""
     table = nuisance.table
     is_drawn = table.free & ~np.isnan(table.tolerance)
     is_drawn &= np.array([name not in stated for name in table.names], dtype=bool)

@@ -109,9 +109,7 @@ def format_exact(value: float, factor: float) -> str:
 
 
 def parse_exact(text: str, factor: float) -> float:
-    """Return the double nearest to the decimal product of a text and a factor, rounded once;
-    decimal.InvalidOperation for other text.
-    """
+    """Return the double nearest to text times factor, rounded once; or raise InvalidOperation."""
     return float(Decimal(text) * _as_decimal(factor))
 
 
@@ -153,10 +151,6 @@ class Cells(Sequence[str]):
         return chain.from_iterable(self.blocks)
 
     def __getitem__(self, place: Any) -> Any:
-        if isinstance(place, slice):
-            return tuple(self)[place]
-        if not 0 <= place < len(self):
-            raise IndexError(f"row {place} does not exist")
         number = bisect_right(self._begins, place) - 1
         return self._texts[number].split("\n")[place - self._begins[number]]
 
@@ -166,8 +160,7 @@ class Table:
     """Cells of a CSV file as text, with their lines.
 
     `units` : column -> unit symbol as written, None where there is none. `columns` : column ->
-    cells without surrounding blanks. `lines` : line of each row. `settings` are empty where the
-    file has none.
+    cells without surrounding blanks. `lines` : line of each row. `settings` may be empty.
     """
 
     path: Path

@@ -109,8 +109,7 @@ def replace_folder(
 
     At every moment, `path` is the old or the new folder, complete. A symbolic link to a folder
     stays a link. `check` raises FileError where a folder must not be replaced, as every OSError
-    does. Folders that killed commands left beside it, with no other files than `names`, are
-    removed.
+    does. Folders of killed commands beside it, with no other files than `names`, are removed.
     """
 
     def is_left_of_us(left: Path) -> bool:

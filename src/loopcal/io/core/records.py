@@ -39,8 +39,7 @@ def read_record(
     location: Location = (),
     word: Callable[[Path, str], FileError] | None = None,
 ) -> T:
-    """Return a record (a dataclass with annotated fields) from plain `content` at a location of a
-    file.
+    """Return a record (a dataclass with annotated fields) from `content` at a location of a file.
 
     `units` are those of the numbers in the file; None where each number states its own, as in `5
     um`. `word` makes the error from the file and what does not fit, for files that nobody edits;

@@ -62,8 +62,7 @@ def _opened(descriptor: Descriptor) -> Iterator[Descriptor]:
 def watch_folder(path: Path) -> Iterator[Callable[[], bool]]:
     """Yield a function that returns whether `path` still names the same folder.
 
-    The folder stays open meanwhile, because a system gives the number of a removed folder to the
-    next one.
+    The folder stays open meanwhile: a system gives the number of a removed folder to the next.
     """
     with _opened(open_folder(path)) as descriptor:
         found = identify(path)  # None between the two renames of another command
@@ -289,9 +288,7 @@ def remove_leftovers(target: Path, is_own: Callable[[Path], bool]) -> None:
 
 @contextmanager
 def _lock_leftover(path: Path) -> Iterator[bool]:
-    """Yield whether a leftover has no living writer; it is locked meanwhile, so that no other
-    command takes it for its own.
-    """
+    """Yield whether a leftover has no living writer; it is locked, so that no other takes it."""
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
     except (OSError, AttributeError):
@@ -380,8 +377,7 @@ def read_text(path: str | Path, what: str, hint: str = "", limit: FileLimit = PR
 def read_bytes(path: str | Path, what: str, limit: FileLimit = PROGRAM_SIZE) -> bytes:
     """Return the content of an ordinary file; `what` it should be is for messages.
 
-    FileError : the file does not exist, is a folder, a device or a pipe, is not readable, or too
-    large.
+    FileError : the file does not exist, is a folder, device or pipe, not readable, or too large.
     """
     with open_bytes(path, what) as stream:
         size = os.fstat(stream.fileno()).st_size
@@ -562,8 +558,7 @@ def iterate_content(content: Mapping[str, Any]) -> Iterator[str]:
 
 
 def read_json(path: str | Path, what: str, action: str, limit: FileLimit = PROGRAM_SIZE) -> Any:
-    """Return the content of a JSON file; `what` it should be and the `action` to take are for
-    messages.
+    """Return the content of a JSON file; `what` it should be and `action` are for messages.
 
     FileError : see `read_text`; or not JSON, a number that is not finite, a key that is there
     twice, or nested too deeply.

@@ -73,8 +73,7 @@ class YamlFile:
 
 
 def read_yaml(path: str | Path, what: str, has_names: bool = True) -> YamlFile:
-    """Read one mapping from a YAML 1.2 file, whose keys and texts are names unless not
-    `has_names`.
+    """Read one mapping from a YAML 1.2 file; its keys and texts are names, if it `has_names`.
 
     FileError : unreadable file, YAML syntax, duplicate key, a key that is not text, a number that
     is not finite, a name that a file must not contain, a YAML tag, or more than the limits allow.
@@ -126,8 +125,6 @@ def _load_content(
         problem = _shorten(error.problem or error.context or "not YAML")
         sentence = f"not valid YAML ({problem}). Check indentation, brackets and colons"
         raise FileError(sentence, path, line) from None
-    except RecursionError:
-        raise YAML_DEPTH.make_error(what, path) from None
     except (YAMLError, ValueError, LookupError, AssertionError) as error:
         if "integer string conversion" in str(error):  # Python reads no more than 4300 digits
             raise FileError("a number has thousands of digits. Write a shorter one", path) from None
@@ -351,8 +348,7 @@ def add_key(file: YamlFile, entry: str, content: Mapping[str, Any] | None = None
     """Return a file with one more key.
 
     `entry` is the key and its value in block style at the left margin, in complete lines; a
-    comment in them is lost where the file is in flow style. `content` is what it says, as far as
-    known.
+    comment in them is lost where the file is in flow style. `content` is what it says, if known.
     """
     added = _parse(entry, file).content if content is None else dict(content)
     return _choose(file, _list_additions(file, entry, added), file.content | added)
@@ -471,9 +467,7 @@ def find_reference(
 
 
 def find_file_beside(file: YamlFile, name: str, location: Location) -> Path | None:
-    """Return the file that `file` names at a location; None where there is no such file, FileError
-    where the path leaves the folder.
-    """
+    """Return a file that `file` names, or None; FileError where its path leaves the folder."""
     path, is_inside = file.path.parent / name, False
     with suppress(OSError, RuntimeError):  # a loop of links
         is_inside = path.resolve().is_relative_to(file.path.parent.resolve())

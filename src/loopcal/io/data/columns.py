@@ -237,8 +237,7 @@ class ColumnRule(NamedTuple):
     """An entry of the registry: one sort of columns.
 
     `pattern`, `unit` and `meaning` are shown in the file reference. `list_columns` returns those
-    that a file on a robot, with some kinds, may have; `match` an open-ended column by its name, or
-    None.
+    that a file on a robot, with some kinds, may have; `match` an open-ended one by name, or None.
     """
 
     pattern: str

@@ -150,8 +150,7 @@ Scope = Literal["session", "all"]
 
 
 def read_kind(file: YamlFile, node: Mapping[str, Any], location: Location) -> Kind:
-    """Return the kind that settings (`node` at a location of the file) describe; keys of others
-    are ignored.
+    """Return the kind that settings (`node` at a location) describe; keys of others are ignored.
 
     FileError : no or an unknown kind, a setting that does not fit it, or a name of a target that
     no column can have.
@@ -897,9 +896,7 @@ def _select_rows(table: Table, entry: KindRows, members: Sequence[tuple[int, ...
 def _read_values(
     table: Table, robot: Mechanism, entry: KindRows
 ) -> tuple[FloatArray, FloatArray, tuple[NoisePart, ...]]:
-    """Return measured values (r, c), the covariance (r, m, m) of their residuals [SI], and its
-    parts where the file states them.
-    """
+    """Return measured values (r, c), the covariance (r, m, m) of residuals [SI], stated parts."""
     kind, rows = entry.kind, entry.rows
     known = list_columns(robot, [kind])
     names = [name_measured(column.name, robot) for column in kind.columns]

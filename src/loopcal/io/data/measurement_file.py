@@ -363,9 +363,7 @@ def _read_readings(file: _File, robot: Mechanism, several: bool) -> _File:
 
 
 def _list_load_columns(table: Table, robot: Mechanism) -> list[str]:
-    """Return the columns that state the loads of elastic drives: these, or the components of the
-    force and moment on the platform.
-    """
+    """Return the columns of the loads of elastic drives, or of force and moment on the platform."""
     loads = [a.name for a in robot.actuators if a.name.startswith(LOAD)]
     forces = [name for name in FORCES if name in table.units]
     names = [name for name in loads if name in table.units]
@@ -597,8 +595,7 @@ def list_unfilled_files(tables: Sequence[Table], data: Measurements) -> tuple[Pa
 
 def list_measurement_files(path: Paths) -> dict[str, Path]:
     """Return role -> file of all files that `load_measurements` reads: `data`, `data-2` and so on
-    with measured values, `poses` with readings alone. FileError : one is given twice, or
-    unreadable.
+    with measured values, `poses` with readings. FileError : one is given twice, or unreadable.
     """
     tables = read_tables(path)
     files: dict[str, Path] = {}

@@ -286,9 +286,7 @@ def _join_rows(
 
 
 def _split_row(row: Row, profile: Profile) -> tuple[Row, Row]:
-    """Return the cells of a line that belong to its pose, and those of one of several targets;
-    raise Misfit for an unknown target.
-    """
+    """Return the cells of a line for its pose and for one target; Misfit where it is unknown."""
     targets = profile.targets
     if "target" not in row or not targets:
         return row, {}

@@ -272,9 +272,7 @@ class Profile:
 
     @cached_property
     def columns_by_target(self) -> Mapping[str, Mapping[str, ColumnSource]]:
-        """Sources of the columns of each target, where a line has those of all targets; otherwise
-        one entry without a name.
-        """
+        """Sources of columns by target, where a line has all of them; else one without a name."""
         if not any(TARGET in str(p) for source in self.columns.values() for p in source.places):
             return {"": self.columns}
 

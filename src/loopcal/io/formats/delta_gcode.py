@@ -64,8 +64,7 @@ Words = dict[Name, float | str]
 class DeltaGeometry:
     """Radius, tower angles, arms and end stops [mm, deg].
 
-    A stop is the height of the nozzle over the bed, in the center, with the carriage of this tower
-    at its end stop.
+    A stop is the height of the nozzle over the bed's center, with this carriage at its end stop.
     """
 
     radius: float

@@ -234,8 +234,7 @@ def parse(path: Path) -> Samples:
 def estimate_anchors(samples: Samples, path: Path) -> FloatArray:
     """Return first estimates of the anchors (n, 3) [mm] from the known poses.
 
-    The known poses determine an anchor least along its line. A taped length therefore replaces its
-    distance.
+    Known poses determine an anchor least along its line: a taped length replaces its distance.
 
     FileError : no pose is known, or the known poses do not determine an anchor.
     """

@@ -170,8 +170,7 @@ def read_config(path: Path, allowed: Sequence[str] = DELTAS) -> KlipperConfig:
 
 
 def read(path: Path, options: ImportOptions) -> Imported:
-    """Read geometry and measurements: heights as the component z, distances as separations of two
-    poses.
+    """Read geometry and measurements: heights as component z, distances as separations of poses.
 
     FileError : an option is missing or not a number, or the printer is not a delta.
     """
@@ -378,8 +377,7 @@ def _parse_steps(cfg: KlipperConfig, option: str) -> tuple[float, ...]:
 def write(source: ExportSource, into: Path | None) -> Exported:
     """Return the corrected numbers in an existing printer.cfg, or a saved block to paste.
 
-    People change options where they are, because an option of the main part would hide one of a
-    pasted block.
+    Options change where they are: one of the main part would hide one of a pasted block.
     """
     own = {part.format(k) for k in "abc" for part in ROTARY_PARTS} | {"shoulder_radius"}
     is_rotary = own <= set(source.robot.parameters.names)

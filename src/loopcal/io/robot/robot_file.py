@@ -95,8 +95,7 @@ def remove_mark(text: str) -> str:
 def read_identified_values(file: YamlFile, robot: Mechanism) -> FloatArray:
     """Return the robot's values (p,) [SI], with those of the file's table in place.
 
-    FileError : a bad row, an unknown or duplicate parameter, a value that is not a number, a wrong
-        unit.
+    FileError : a bad row, an unknown or duplicate parameter, no number, or a wrong unit.
     """
     values = robot.values.copy()
     for name, value in read_rows(file, robot).items():

@@ -177,8 +177,7 @@ def load_administration(path: str | Path, is_complete: bool = True) -> Administr
 
     is_complete : whether the texts that a certificate needs must be there.
 
-    FileError : a key is unknown, a needed text is empty, or a text is not a date or code, at its
-        line.
+    FileError : an unknown key, a needed text is empty, or one is not a date or code, at its line.
     """
     file = read_yaml(path, "file of report facts", has_names=False)
     facts = read_record(file, file.content, Administration, None)

@@ -642,8 +642,7 @@ def write_run_folder(
 def read_run_folder(path: str | Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Return the contents of result.json and arrays.npz of a run folder.
 
-    FileError : not a run folder, of another format, or damaged; with the file and what is wrong
-        in it.
+    FileError : not a run folder, of another format, or damaged; with the file and the damage.
     """
     path = as_path(path, "run folder")
     if not (path / RESULT).is_file():

@@ -223,8 +223,7 @@ def split_values(text: str, count: int) -> tuple[str, list[str] | None]:
     """Return the pose that a typed line names, empty for none, and its `count` numbers; None where
     the line is no row. A `-` stands for a value that was not measured.
 
-    Numbers are separated by blanks, tabs or semicolons, else by commas; then a comma is a decimal
-    mark.
+    Blanks, tabs or semicolons separate numbers, else commas; then a comma is a decimal mark.
     """
     words = [word.strip(",") for word in text.replace(";", " ").split()]
     if len(words) not in (count, count + 1):

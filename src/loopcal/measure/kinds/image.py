@@ -118,9 +118,7 @@ def find_present(pixels: FloatArray) -> BoolArray:
 
 
 def shows_board(points: FloatArray, pixels: FloatArray) -> BoolArray:
-    """Return which pictures (n, k, 2) show enough of the points (k, 3) for the pose of the board:
-    four or more that are not on a line.
-    """
+    """Return which pictures (n, k, 2) show four of the points (k, 3) or more, not on a line."""
     present = find_present(pixels)
     enough = present.sum(axis=1) >= FEWEST
     for i in np.flatnonzero(enough):

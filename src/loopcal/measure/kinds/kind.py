@@ -384,9 +384,7 @@ class Kind(ABC):
 
     @cached_property
     def common_errors(self) -> Mapping[int, str]:
-        """Place among the u parameters -> common error of the instrument, such as `tracker.bias`
-        for each of its components.
-        """
+        """Place among the u parameters -> common error of the instrument, as `tracker.bias`."""
         return {
             i: name_shared_error(self, item, "").rstrip(".")
             for item in self.shared_errors
@@ -567,8 +565,7 @@ class Kind(ABC):
 
     def compare_platform(self, measured: MeasuredColumns) -> tuple[FloatArray, FloatArray] | None:
         """Return references (t, r, 12), and S (m, 6) with which the residuals are S times the
-        differences of the platform's poses from these, see `engine.compare_poses`; None where they
-        are not.
+        differences of the platform's poses from these by `engine.compare_poses`, or None.
         """
         return None
 

@@ -287,8 +287,7 @@ def _is_singular(rates: FloatArray) -> BoolArray:
 
 
 def compare_poses(T: FloatArray, reference: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return residuals (t, r, 6) of poses T (t | 1, r, 4, 4), and their derivatives (t, r, 6, 6) by
-    the twists of T.
+    """Return residuals (t, r, 6) of poses T (t | 1, r, 4, 4), with derivatives by the twists of T.
 
     reference : (t | 1, r, 12) rotations row by row, then positions.
     """

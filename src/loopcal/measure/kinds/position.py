@@ -352,9 +352,7 @@ class Position(TargetKind):
 
     @property
     def locates_frame(self) -> bool:
-        """Whether stated places of targets on the base are not collinear, so that their measured
-        positions determine the frame.
-        """
+        """Whether targets at stated places on the base determine the frame: not on a line."""
         if not self.is_of_base or self.places is None or "frame" not in self.unknown:
             return False
         return len(self.places) > 2 and not bool(_are_collinear(self.places))

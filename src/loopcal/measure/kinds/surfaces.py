@@ -37,8 +37,7 @@ class SurfaceKind(TargetKind):
     surface : name of the surface; its parameters begin with it. A plane and a line with equal name,
         point and direction share `u` and `v`: the line is perpendicular to the plane.
     Others : see `TargetKind`; "frame", "surface" and "targets" (the offsets of the probe) may be
-    unknown. Faces of a body with known dimensions, such as a datum cube, are known surfaces in one
-    unknown frame.
+    unknown. Faces of a known body, such as a datum cube, are known surfaces in an unknown frame.
     """
 
     through: FloatArray = checked(check_point, "the point of the surface", np.zeros(3))

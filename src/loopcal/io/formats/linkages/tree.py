@@ -192,8 +192,7 @@ def parse_xml(text: str, path: Path, what: str) -> Element:
 
 @dataclass(frozen=True, eq=False)
 class TreeJoint:
-    """A joint from link `parent` to `child`: R, P, S, U (about `axis`, then `axis_2`), or "" for a
-    fixed one.
+    """A joint from link `parent` to `child`: R, P, S, U (about `axis`, then `axis_2`), "" if fixed.
 
     `origin` : (4, 4) T_parent_joint [m]. `axis`, `axis_2` : (3,) unit vectors. `limits` : [rad or
     m]. `line` : from 1. `element` : what states its origin, None without. `mimic` : the joint that
