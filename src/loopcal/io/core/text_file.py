@@ -384,7 +384,7 @@ def read_bytes(path: str | Path, what: str, limit: FileLimit = PROGRAM_SIZE) -> 
         limit.check(size, what, path)
         raw = b""
         while len(raw) <= limit.count:  # the file may grow, or the system states no size
-            part = stream.read((limit.count if raw else size) + 1)
+            part = stream.read(min(max(size, len(raw), 1 << 16), limit.count) + 1)
             if part is None:  # reading would wait for more, as in /proc/kmsg
                 raise BlockingIOError(errno.EAGAIN, os.strerror(errno.EAGAIN))
             if not part:
