@@ -18,7 +18,6 @@ import numpy as np
 
 from loopcal.errors import DataError
 from loopcal.numerics.decomposition import are_nonzero
-from loopcal.numerics.elimination import shorten_rows
 from loopcal.typing import FloatArray, IntArray
 from loopcal.units import Dimension
 
@@ -746,8 +745,7 @@ def solve_frame_and_points(
     known = np.where(is_there, measured, 0.0)
     M = (np.eye(3)[:, :, None] * known[:, :, None, None, :]).reshape(s, 3 * q, 9)
     b = (constant * is_there).reshape(s, 3 * q, 1)
-    rows = shorten_rows(np.concatenate([C, M, b], axis=-1), w + 3)
-    C, both, M, b = rows[..., : w + 3], rows[..., w + 3 :], rows[..., w + 3 : -1], rows[..., -1:]
+    both = np.concatenate([M, b], axis=-1)
     Q, size, V = np.linalg.svd(C, full_matrices=False)
     used = are_nonzero(size, ALIGNMENT_TOLERANCE)[:, None, :]
     Q = Q * used

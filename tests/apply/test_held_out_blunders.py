@@ -182,7 +182,9 @@ def test_predicted_distances_of_right_rows_have_the_chi_square_distribution(
 def _check(fit, held_out):
     values = dict(fit.nuisance.values)
     kept = tuple(fit.nuisance.names)
-    check = check_held_out_rows(fit.robot, held_out, values, kept, collect_uncertainty(fit))
+    check = check_held_out_rows(
+        fit.robot, held_out, values, frozenset(kept), collect_uncertainty(fit)
+    )
     assert check is not None
     return check
 

@@ -468,7 +468,7 @@ def test_held_out_rows_are_predicted_with_the_discrepancy():
     fit = add_model_discrepancy(identify(robot, data, MAP()), data)
     assert find(fit)
     other = measure(fit.robot, 40).take(np.arange(30, 40))
-    blocks = Predictor(fit.robot, {}, (), collect_uncertainty(fit), ()).make_blocks(other)
+    blocks = Predictor(fit.robot, {}, frozenset(), collect_uncertainty(fit), ()).make_blocks(other)
     u = pose_uncertainty(fit, forward(fit.robot, other.readings), frame="base")
     noise = fit.residual_test.sigma_scale * SIGMA
     for group in blocks.groups:

@@ -95,7 +95,7 @@ def test_rows_do_not_grow_with_other_sessions_and_targets() -> None:
         rows = collect_residual_rows(linear)
         assert rows is not None
         kept, values = fit.nuisance.names, fit.nuisance.values
-        predictor = Predictor(fit.robot, values, kept, collect_uncertainty(fit), ())
+        predictor = Predictor(fit.robot, values, frozenset(kept), collect_uncertainty(fit), ())
         sizes[sessions, targets] = (
             sum(part.rows.nbytes for parts in blocks for part in parts),
             rows.basis.wide.nbytes + getattr(rows.basis.narrow, "nnz", 0) * 12,

@@ -144,6 +144,23 @@ def test_start_values_of_all_sessions_are_sought_together(name, monkeypatch):
     assert none.shape == (0, len(found))  # such as readings with which the robot reaches no pose
 
 
+def test_a_frame_is_sought_with_a_few_of_many_targets(monkeypatch):
+    rng, widths, minimize = np.random.default_rng(1), [], initial_values.minimize_from_starts
+    names = tuple(f"t{i}" for i in range(20))
+    kind = Position(targets=names, places=np.zeros((20, 3)), unknown=("frame", "targets"))
+    T = poses(rng)
+    data, local, _ = simulate_rows(kind, T, rng)
+
+    def record(*given):
+        widths.append(given[1].shape[1])
+        return minimize(*given)
+
+    monkeypatch.setattr(initial_values, "minimize_from_starts", record)
+    found = guess_nuisance_values(data, T, local)
+    assert widths == [6 + 3 * 8, 6 + 3 * 20]  # the last one from the best start, with all rows
+    assert_allclose(whitened_residuals(data, T, local, found), 0.0, atol=1e-3)
+
+
 def test_fixed_values_are_kept_and_priors_change_start_values():
     rng = np.random.default_rng(2)
     T = poses(rng)

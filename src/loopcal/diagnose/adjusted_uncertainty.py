@@ -385,7 +385,7 @@ def assess_tails(rows: ResidualRows) -> HeavyTails:
     left = 1.0 - rows.basis.take(kept).squares()
     testable = left > TESTABLE
     kept, left = kept[testable], left[testable]
-    basis = rows.basis.take(kept).toarray()
+    basis = rows.basis.localize(kept)[1]
     if basis.shape[1] > len(kept):  # as many variables do the same
         basis = np.asarray(np.linalg.qr(basis.T, mode="r")).T
     if left.sum() < FEWEST:

@@ -50,6 +50,7 @@ from loopcal.numerics.elimination import (
     EliminationTree,
     NodeFactors,
     TreeElimination,
+    UnknownRoot,
     build_tree,
     eliminate_tree,
     spread_columns,
@@ -186,7 +187,7 @@ class Predictor(NamedTuple):
 
     robot: Mechanism  # the calibrated one
     values: Mapping[str, float]  # name -> nuisance parameter [SI]
-    kept: tuple[str, ...]  # names of those that the fit knows; the others are unknown
+    kept: frozenset[str]  # names of those that the fit knows; the others are unknown
     # of the fit; None where robot and nuisance parameters are taken as exact
     uncertainty: FitUncertainty | None
     unknown: tuple[str, ...]
@@ -287,22 +288,18 @@ class Predictor(NamedTuple):
         """Return the numbers (U, e) of the other variables that move each nuisance parameter at a
         known machine, -1 for none, and the derivatives (U, e) by these.
         """
-        fit, listed, unknown = self.uncertainty, [], {n: i for i, n in enumerate(self.unknown)}
-        places = {} if fit is None else {name: i for i, name in enumerate(fit.names)}
-        for name, dimension in zip(names, dimensions, strict=True):
-            row, columns = np.zeros(0), np.zeros(0, dtype=int)
-            if fit is not None and name in self.kept and name in places:
-                row, columns = fit.root.values[places[name]], fit.root.columns[places[name]]
-            elif name in self.unknown:
-                unit = self.robot.size if dimension is Dimension.LENGTH else 1.0
-                first = 0 if fit is None else fit.root.total
-                row, columns = np.array([ANYWHERE * unit]), first + np.array([unknown[name]])
-            listed.append((columns[row != 0.0], row[row != 0.0]))
-        widest = max((len(used) for used, _ in listed), default=0)
-        numbers, root = np.full((len(names), widest), -1), np.zeros((len(names), widest))
-        for i, (used, row) in enumerate(listed):
-            numbers[i, : len(used)], root[i, : len(used)] = used, row
-        return numbers, root
+        fit, unknown = self.uncertainty, {name: i for i, name in enumerate(self.unknown)}
+        root = UnknownRoot.make_empty(len(names))
+        if fit is not None:
+            places = {name: i for i, name in enumerate(fit.names) if name in self.kept}
+            root = fit.root.take(np.array([places.get(n, -1) for n in names], dtype=np.int64))
+            unknown = {name: i for name, i in unknown.items() if name not in places}
+        units = [self.robot.size if d is Dimension.LENGTH else 1.0 for d in dimensions]
+        free = np.array([root.total + unknown[n] if n in unknown else -1 for n in names], dtype=int)
+        numbers = np.column_stack([root.columns, free])
+        values = np.column_stack([root.values, np.where(free < 0, 0.0, ANYWHERE * np.array(units))])
+        used = (values != 0.0).any(axis=0)
+        return np.where(values == 0.0, -1, numbers)[:, used], values[:, used]
 
 
 def _build_tree(moved: Sequence[IntArray], count: int) -> EliminationTree:
@@ -342,7 +339,7 @@ def check_held_out_rows(
     robot: Mechanism,
     data: Measurements,
     values: Mapping[str, float],
-    kept: tuple[str, ...],
+    kept: frozenset[str],
     uncertainty: FitUncertainty | None = None,
 ) -> HeldOutCheck | None:
     """Search the held-out blocks that neither the fit nor the other blocks explain; None without

@@ -387,7 +387,7 @@ class PosePredictions:
     # the setup parameters (frames, targets, surfaces, offsets) of the measurements
     setup: NuisanceParameters
     values: FloatArray  # (1, U) their values [SI]
-    kept: tuple[str, ...]  # names of those that were given and not fitted
+    kept: frozenset[str]  # names of those that were given and not fitted
 
     @property
     def fitted_count(self) -> int:
@@ -396,8 +396,9 @@ class PosePredictions:
 
     def regrouped(self, data: Measurements) -> PosePredictions:
         """Return the same prediction for fewer rows of the same poses."""
-        setup, names = data.nuisance_parameters, self.setup.table.names
-        values = self.values[:, [names.index(name) for name in setup.table.names]]
+        setup = data.nuisance_parameters
+        places = {name: i for i, name in enumerate(self.setup.table.names)}
+        values = self.values[:, [places[name] for name in setup.table.names]]
         return replace(self, setup=setup, values=values)
 
     def residuals(self, observations: Sequence[Observations]) -> list[FloatArray]:
@@ -656,9 +657,9 @@ def predict_poses(
     names = list_sensed_joints(o.kind for o in data.observations)
     joints = select_joint_values(robot, names, solution.q[None], solution.state)
     unknowns = data.nuisance_parameters
-    values, kept = unknowns.values(), ()
+    values, kept = unknowns.values(), frozenset[str]()
     if setup is not None and len(unknowns):
-        kept = tuple(name for name in unknowns.table.names if name in setup)
+        kept = frozenset(unknowns.table.names) & setup.keys()
         values = guess_nuisance_values(data, T, _fix_nuisance(unknowns, setup), joints)
     return PosePredictions(T[None], joints, unknowns, values[None], kept)
 

@@ -35,6 +35,9 @@ ALIKE = 1.0
 # Rows of a group, and values for each of its unknowns, from which start values are sought: more
 # would make them no better, since the geometry of the robot is not known yet.
 FEWEST_ROWS, VALUES = 60, 20.0
+# Targets from which a start value of their frame is sought; positions are linear in the places of
+# the others, which begin at nominal values.
+TARGETS = 8
 
 
 class EvaluatedRows(NamedTuple):
@@ -157,12 +160,18 @@ def guess_nuisance_values_batch(
 
     measured : (t, r, c) of each kind; those of targets on the base last.
     T : (t | 1, n, 4, 4) T_base_platform.
-    most : number of candidates of each set to refine, those with the lowest cost; default all.
+    most : number of candidates of each set to refine, those with the lowest cost; default all, and
+        of many targets an even choice, because a fit to all rows follows.
     """
-    observations = measurements.all_observations
+    observations, own = measurements.all_observations, nuisance
     sets = max((len(m) for m in measured), default=len(T))
     values = np.tile(nuisance.values(), (sets, 1))
-    for groups in _list_groups(measurements, nuisance) if sets else ():
+    if most is None:
+        parts = zip(observations, measured, nuisance.indices, strict=True)
+        chosen = [_choose_targets(*part) for part in parts]
+        observations, measured, indices = zip(*chosen, strict=True) if chosen else ((), (), ())
+        own = replace(nuisance, indices=indices)
+    for groups in _list_groups(observations, own) if sets else ():
         rows = observations[groups.number]
         given = (measured[groups.number], T, values[:, groups.parameters])
         refined, cost = _refine_candidates(rows, groups, *given, most, steps)
@@ -182,7 +191,7 @@ def find_equal_values(
     observations, cluster = measurements.all_observations, _find_clusters(nuisance)
     others = values[None]
     used = np.ones(int(cluster.max(initial=-1)) + 1, dtype=np.int64)  # values of each cluster
-    for groups in _list_groups(measurements, nuisance, is_alone=True):
+    for groups in _list_groups(observations, nuisance, is_alone=True):
         rows = observations[groups.number]
         given = (rows.measured[None], T[None], values[None, groups.parameters])
         try:
@@ -208,6 +217,27 @@ def find_equal_values(
     return np.where(kept, others, values)[1:]
 
 
+def _choose_targets(
+    rows: Observations, measured: FloatArray, indices: IntArray
+) -> tuple[Observations, FloatArray, IntArray]:
+    """Return rows of an even choice of many unknown targets, with several sets of measured values
+    (t, r, c) and the parameters (r, u); all where the choice lacks most of a row.
+    """
+    kind, k = rows.kind, len(getattr(rows.kind, "targets", ()))
+    if not isinstance(kind, Position) or kind.places is None or k <= TARGETS:
+        return rows, measured, indices
+    few, seen = choose_evenly(k, TARGETS), rows.present.reshape(-1, k, 3)[..., 0]
+    if (seen[:, few].sum(axis=1) < np.minimum(seen.sum(axis=1), TARGETS // 2)).any():
+        return rows, measured, indices
+    chosen = replace(kind, targets=tuple(kind.targets[i] for i in few), places=kind.places[few])
+    cells = (3 * few[:, None] + np.arange(3)).ravel()
+    own = {"measured": rows.measured[:, cells], "noise_parts": ()}
+    own["covariance"] = rows.covariance[:, cells[:, None], cells]
+    names = [parameter.name for parameter in kind.nuisance_parameters]
+    used = [names.index(parameter.name) for parameter in chosen.nuisance_parameters]
+    return replace(rows, kind=chosen, **own), measured[..., cells], indices[:, used]
+
+
 class _Groups(NamedTuple):
     """g groups of rows of one kind, each of which shares its parameters."""
 
@@ -220,7 +250,7 @@ class _Groups(NamedTuple):
 
 
 def _list_groups(
-    measurements: Measurements, nuisance: NuisanceParameters, *, is_alone: bool = False
+    observations: Sequence[Observations], nuisance: NuisanceParameters, *, is_alone: bool = False
 ) -> Iterator[_Groups]:
     """Give the groups of rows that use the same parameters, of which some are to be found, those of
     one kind with about as many rows together.
@@ -237,7 +267,6 @@ def _list_groups(
         return 2 if kind.is_of_base else 1
 
     known = ~(nuisance.table.free & np.isnan(nuisance.table.tolerance))
-    observations = measurements.all_observations
     kinds = [(rank(rows.kind), type(rows.kind)) for rows in observations]
     listed: list[tuple[int, IntArray, IntArray]] = []
     for i, rows in enumerate(observations):
