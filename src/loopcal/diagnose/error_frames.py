@@ -231,9 +231,8 @@ def refer_errors(
     extra = fit(twists - M @ begin.by_parameters)
     moved = _moved_frames(fit, extra, twists)
     if frame == BASE or not moved:
-        undetermined = moved if frame == BASE else ()
         return ErrorFrame(
-            frame, robot.size, begin.by_parameters, begin.own, (), undetermined, begin.name, over
+            frame, robot.size, begin.by_parameters, begin.own, (), moved, begin.name, over
         )
     by_parameters, own = begin.by_parameters + extra, begin.own - fit(M @ begin.own)
     return ErrorFrame(frame, robot.size, by_parameters, own, moved, (), begin.name, over)

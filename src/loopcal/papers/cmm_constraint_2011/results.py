@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from itertools import groupby
+from operator import itemgetter
 from time import process_time
 from typing import Any
 
@@ -43,7 +44,7 @@ from loopcal.planning.plane_line_planning import (
     list_axes,
     make_plane_line_instrument,
 )
-from loopcal.studies.simulation.block import CalibratedCell, calibrate_cells, set_size
+from loopcal.studies.simulation.block import calibrate_cells, set_size
 from loopcal.studies.simulation.machines import build_robot_of, measure_held_points
 from loopcal.studies.simulation.published_steps import Layout, linearize_products, map_displacements
 from loopcal.studies.specification import FEWEST_POINTS, PosesLevel
@@ -360,11 +361,8 @@ def calibrate(study: Study, grid: GridStudy | None = None) -> dict[Key, Cell]:
     and noise.
     """
     grid, cells = grid or study.grid, dict[Key, Cell]()
-
-    def get_key(cell: CalibratedCell) -> Key:
-        return cell.levels["errors"], cell.levels["instrument"]
-
-    for (errors, noise), group in groupby(calibrate_cells(grid), get_key):
+    get_key = itemgetter("errors", "instrument")
+    for (errors, noise), group in groupby(calibrate_cells(grid), lambda c: get_key(c.levels)):
         made = {cell.levels["method"]: cell for cell in group}
         truth = made[LS].truth
         values = {BEFORE: study.robot.values[None]} | {m: cell.values for m, cell in made.items()}

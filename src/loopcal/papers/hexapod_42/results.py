@@ -274,10 +274,6 @@ class Iterations:
         met = np.flatnonzero(self.integrated[1:] <= threshold)
         return int(met[0]) + 1 if len(met) else None
 
-    def find_end(self, threshold: float) -> int:
-        """Return the state at which the rule ends the steps: the last one where it never does."""
-        return self.count_needed(threshold) or len(self.integrated) - 1
-
 
 def draw_measured_poses(
     setup: Setup, limits: tuple[float, float], seed: int = 0, trial: int = 0
@@ -595,7 +591,7 @@ def _make_own_tables(results: Results) -> tuple[published.Table, ...]:
     errors that are left by the rule.
     """
     setup, runs = results.setup, results.runs
-    ends = {name: run.find_end(setup.epsilon) for name, run in runs.items()}
+    ends = {name: run.count_needed(setup.epsilon) or -1 for name, run in runs.items()}
     robot, truth = setup.robot, setup.truth.values
     left = [truth - runs[name].values[ends[name]] for name in ("exact", PRESUMED, STATED)]
     columns = list(map(robot.list_shown, (robot.values, truth - robot.values, *left)))
