@@ -66,7 +66,6 @@ from loopcal.numerics.decomposition import (
 )
 from loopcal.results.description import Field, fields, label_axes
 from loopcal.results.result import DrawnResult, Result
-from loopcal.results.tables import Block
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import Dimension
 
@@ -101,12 +100,6 @@ class Observability:
         """Return index, value and meaning, for a table."""
         return [(name.upper(), getattr(self, name), meaning) for name, meaning in MEANING.items()]
 
-    def __str__(self) -> str:
-        values = ", ".join(f"{name} {value:.3g}" for name, value, _ in self.rows())
-        without = f", without {self.left_out} null directions" if self.left_out else ""
-        counts = f"m = {self.equations}, L = {self.directions}{without}"
-        return f"Observability: {values} ({self.scaling}; {counts})"
-
 
 def compute_observability(singular_values: FloatArray, rank: int, equations: int) -> Observability:
     """Return the indices of the singular values of whitened rows in units of tolerance.
@@ -132,7 +125,6 @@ def compute_observability(singular_values: FloatArray, rank: int, equations: int
 
 MOST_WEAK = 5  # number of weak directions that are listed, weakest first
 AROUND = 3  # number of singular values listed before the cut
-MOST_ROWS = 12  # number of parameters in the printed table; the others are counted
 CLEAR_GAP = 1e3  # ratio of the singular values at the cut that makes the rank clear
 # Multiples of the rank tolerance between which a clear rank does not change.
 NEARBY_TOLERANCES = (1e-2, 1e2)
@@ -198,10 +190,6 @@ class Identifiability(DrawnResult):
     )
     LABELS: ClassVar[Mapping[str, Any]] = label_axes(parameter="free_parameters.names")
 
-    def page(self) -> list[Block]:
-        """Return the findings and the parameters."""
-        return ["\n".join(map(str, self.findings)), self.main_table()]
-
     @property
     def n_parameters(self) -> int:
         """Number p of free parameters."""
@@ -248,18 +236,6 @@ class Identifiability(DrawnResult):
         name, rank = self.free_parameters.robot.name, f"rank {self.rank} of {self.n_parameters}"
         numbers = f"{self.n_equations} equations, condition {round_to_digits(self.condition)}"
         return f"<Identifiability of {name}: {rank}, {numbers}>"
-
-    def __str__(self) -> str:
-        lines = [str(finding) for finding in self.findings]
-        shown = sorted(self.parameters, key=lambda p: (not p.partners, -round(p.left, 6)))
-        width = max(len(p.name) for p in shown[:MOST_ROWS])
-        lines += ["", f"{'parameter':<{width}}  sd / prior sd   determined"]
-        for p in shown[:MOST_ROWS]:
-            state = {"determined": "yes", "not at all": "no"}.get(p.state, "only in combination")
-            lines.append(f"{p.name:<{width}}  {p.left:>14.2f}  {state}")
-        if len(shown) > MOST_ROWS:
-            lines.append(f"{len(shown) - MOST_ROWS} more parameters")
-        return "\n".join([*lines, "", str(self.indices)])
 
     @property
     def findings(self) -> tuple[Finding, ...]:

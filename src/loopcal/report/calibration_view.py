@@ -54,6 +54,7 @@ if TYPE_CHECKING:
     from loopcal.apply.height_errors import HeightErrors
     from loopcal.apply.inspection import IdentifiabilityReport
     from loopcal.diagnose.fit_examination import ReadingError
+    from loopcal.diagnose.identifiable_parameters import Identifiability, Observability
     from loopcal.estimate.prior_inflation import PriorConflict
     from loopcal.mechanism.model import Mechanism
     from loopcal.typing import FloatArray
@@ -551,18 +552,33 @@ def view_identifiability(report: IdentifiabilityReport, verbose: bool = False) -
         )
         blocks.append(table)
     if verbose or analysis.n_parameters <= FEW_PARAMETERS:
-        states = {"determined": "yes", "not at all": "no"}
-        rows = []
-        for row in analysis.parameters:
-            others = f"only with {list_names(row.others, MOST_COMBINATIONS // 2)}"
-            rows.append((row.name, states.get(row.state) or others, f"{row.left:.2f}"))
-        determined = word_column("determined", wraps=True)
-        columns = ("name", determined, Column("sd / prior sd"))
-        blocks += [make_table("Parameters", columns, rows), say("parameters.sd")]
+        blocks += _view_parameter_states(analysis)
     if verbose:
-        values = [(n, meaning, format_number(x, 3)) for n, x, meaning in analysis.indices.rows()]
-        meaning = word_column("meaning", wraps=True)
-        blocks.append(make_table("Observability", ("index", meaning, Column("value")), values))
+        blocks.append(_build_observability_table(analysis.indices))
     if report.subset is not None:
         blocks += ["", str(report.subset)]
     return blocks
+
+
+@register("page", "loopcal.diagnose.identifiable_parameters:Identifiability")
+def _view_analysis(analysis: Identifiability) -> list[Block]:
+    """Return the findings on what measurements determine, the parameters, and the indices."""
+    tables = _view_parameter_states(analysis), _build_observability_table(analysis.indices)
+    return [*map(str, analysis.findings), *tables[0], tables[1]]
+
+
+def _view_parameter_states(analysis: Identifiability) -> list[Block]:
+    """Return the table of what measurements determine of each parameter, and its meaning."""
+    states, rows = {"determined": "yes", "not at all": "no"}, []
+    for row in analysis.parameters:
+        others = f"only with {list_names(row.others, MOST_COMBINATIONS // 2)}"
+        rows.append((row.name, states.get(row.state) or others, f"{row.left:.2f}"))
+    columns = ("name", word_column("determined", wraps=True), Column("sd / prior sd"))
+    return [make_table("Parameters", columns, rows), say("parameters.sd")]
+
+
+def _build_observability_table(indices: Observability) -> Table:
+    """Return the observability indices with their meaning."""
+    values = [(n, meaning, format_number(x, 3)) for n, x, meaning in indices.rows()]
+    columns = ("index", word_column("meaning", wraps=True), Column("value"))
+    return make_table("Observability", columns, values)
