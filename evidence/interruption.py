@@ -83,7 +83,7 @@ CASES = {
     "bootstrap": Case("bootstrap run -o out.csv --count 50 --force", ("out.csv",)),
     "sample": Case("sample run -o out.csv --force", ("out.csv",)),
     "identifiability": Case(
-        "identifiability five-bar data.csv --reduce -o out.yaml --force", ("out.yaml",)
+        "identifiability five-bar data.csv --fix-unidentifiable -o out.yaml --force", ("out.yaml",)
     ),
     "check": Case("check five-bar --plot out.png --force", ("out.png",)),
 }

@@ -44,7 +44,7 @@ example
 example hexapod-42
 completion bash
 identifiability a.yaml --draw 20 {POSITION}
-identifiability a.yaml --draw 20 --reduce --useful 10um {POSITION}
+identifiability a.yaml --draw 20 --fix-unidentifiable --useful 10um {POSITION}
 plan a.yaml -o plan --poses 12 --candidates 40 {POSITION}
 gcode a.yaml plan -o poses.ngc
 simulate a.yaml --fill plan/measurements.csv --draw-errors --truth truth.yaml -o d.csv
@@ -167,6 +167,11 @@ def stop_app(err: io.StringIO) -> None:
 
 def run_commands(lines: str = LINES) -> Iterator[tuple[str, dict[str, Any]]]:
     """Yield name and document of each command line, run in the current folder."""
+    return ((name, json.loads(text)) for name, text in print_commands(lines, "--json"))
+
+
+def print_commands(lines: str = LINES, *options: str) -> Iterator[tuple[str, str]]:
+    """Yield name and screen of each command line with `options`, run in the current folder."""
     for name, text in INPUTS.items():
         Path(name).write_text(text)
     write_pictures(Path("pictures"))
@@ -180,9 +185,9 @@ def run_commands(lines: str = LINES) -> Iterator[tuple[str, dict[str, Any]]]:
         if words[0] == "app":
             threading.Thread(target=stop_app, args=(err,), daemon=True).start()
         with redirect_stdout(out), redirect_stderr(err):
-            found = main([*words, "--json"])
+            found = main([*words, *options])
         assert found == code, (line, found, out.getvalue()[-800:], err.getvalue()[-800:])
-        yield " ".join(words[: 1 + (words[0] == study.name)]), json.loads(out.getvalue())
+        yield " ".join(words[: 1 + (words[0] == study.name)]), out.getvalue()
 
 
 # Names of JSON types -> what Python reads.

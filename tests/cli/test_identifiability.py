@@ -45,7 +45,7 @@ def test_json_gives_the_reason_for_a_number_that_is_not_finite(loopcal):
 
 
 def test_reduce_writes_a_robot_file_with_identifiable_parameters_only(loopcal, tmp_path):
-    words = "hexapod-42 --frames base --reduce -o smaller.yaml"
+    words = "hexapod-42 --frames base --fix-unidentifiable -o smaller.yaml"
     out = loopcal(words, "36 of 42 parameters contain all information").out
     assert out.count("Fix leg") == 6
     assert lc.load_robot(tmp_path / "smaller.yaml").parameters.free.sum() == 36
@@ -55,7 +55,7 @@ def test_reduce_writes_a_robot_file_with_identifiable_parameters_only(loopcal, t
 
 
 def test_json_contains_combinations_suggestions_reduction_and_indices(loopcal):
-    document = loopcal("3-prs --measure x,y,z,phi,theta --reduce --json").json
+    document = loopcal("3-prs --measure x,y,z,phi,theta --fix-unidentifiable --json").json
     assert sorted(document["unidentifiable"][0]["names"]) == ["a1y", "a2y", "a3y"]
     assert document["remedies"][0]["cures"][0]["words"] == "psi"
     assert document["reduction"]["dropped"][0]["name"] == "a3y"
@@ -73,7 +73,7 @@ def test_json_contains_combinations_suggestions_reduction_and_indices(loopcal):
         ("3-prs --frames floor", "an unknown frame is 'floor', but must be one of 'base', 'tool'"),
         ("3-prs --kind inclination --frames base", "this kind of measurement has no base frame"),
         ("3-prs data.csv --measure x", "DATA defines the instrument"),
-        ("3-prs -o smaller.yaml", "-o writes the robot of --reduce"),
+        ("3-prs -o smaller.yaml", "-o writes the robot of --fix-unidentifiable"),
         (f"{READ}=5", "--sigma-reading '5' for q1: '5' has no unit"),
         (f"{READ}=5urad", "'urad' is a unit of angle, not of a length"),
         (f"{READ}=-5um", "for q1 is -5um. Give a number above zero, or zero for exact"),

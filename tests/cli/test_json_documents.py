@@ -3,6 +3,7 @@
 
 import io
 import json
+import re
 
 import jsonschema
 import pytest
@@ -38,6 +39,32 @@ def test_documents_of_all_commands_follow_the_published_schema(tmp_path, monkeyp
         seen.add(name)
         if "$schema" not in document:
             assert not list_faults(name, document)
+    assert seen == set(COMMANDS)
+
+
+@pytest.mark.slow
+def test_screens_of_all_commands_have_one_order(tmp_path, monkeypatch) -> None:
+    """A sentence, then tables, and at most one next step; of a calibration first verdict and
+    accuracy, then the errors, what was found, and what to do.
+    """
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.stdin", io.StringIO(""))
+    seen = set()
+    for name, screen in output_schema.print_commands():
+        seen.add(name)
+        lines = screen.strip().splitlines()
+        tables = [i for i, line in enumerate(lines) if set(line) == {"─"}]
+        steps = [i for i, line in enumerate(lines) if line.startswith("Next: ")]
+        assert len(steps) <= 1, screen
+        if tables:
+            assert tables[0] >= 2, screen  # below a caption or a sentence, and the head
+            assert not steps or tables[0] < steps[0], screen
+        if name == "calibrate":
+            sentences = [".*alibrated: |Undecided: ", "(Typical|Expected) error ", "Errors at "]
+            if lines[0].startswith("Not "):
+                del sentences[1]
+            order = [next(i for i, x in enumerate(lines) if re.match(s, x)) for s in sentences]
+            assert [0, *order, tables[0], steps[0]] == sorted([*order, 0, tables[0], steps[0]])
     assert seen == set(COMMANDS)
 
 

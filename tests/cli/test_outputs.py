@@ -53,7 +53,7 @@ REFUSED = {
     "compensate robot.yaml pp.csv -o robot.yaml --force": IS_INPUT,
     "compensate robot.yaml pp.csv -o old.csv": EXISTS,
     "check robot.yaml --plot old.png": EXISTS,
-    "identifiability robot.yaml data.csv --reduce -o robot.yaml --force": IS_INPUT,
+    "identifiability robot.yaml data.csv --fix-unidentifiable -o robot.yaml --force": IS_INPUT,
     "export robot.yaml --format csv -o robot.yaml --force": IS_INPUT,
     "new gough -o a.yaml --measurements nodir/x.csv": NO_FOLDER,
     "new 3-prs -o old.csv": EXISTS,

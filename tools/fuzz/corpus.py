@@ -221,7 +221,7 @@ def _list_lines(recipe: Recipe) -> Iterator[Line]:
         1 simulate run/robot.yaml --draw 6 -o out.csv {recipe.instrument}
         6 identifiability robot.yaml data.csv
         1 identifiability robot.yaml --poses targets.csv {plan}
-        1 identifiability robot.yaml data.csv --reduce -o reduced.yaml
+        1 identifiability robot.yaml data.csv --fix-unidentifiable -o reduced.yaml
         2 regularize robot.yaml data.csv
         1 regularize robot.yaml data.csv -o out --folds 2 --json
         3 calibrate robot.yaml data.csv -o out --hold-out 0.3

@@ -76,6 +76,7 @@ def new(
     refuse_outputs((output, measurements, report_facts), (), force)
     texts: dict[Path, str] = {}
     page: list[Block] = []
+    following: list[Block] = []
     if family is not None and output is not None:
         texts[output] = format_new_robot(family, make_name(output.stem))
         robot = build_robot(parse_yaml(texts[output], output, "robot file"))
@@ -85,21 +86,23 @@ def new(
             texts[schema_file] = to_json(opt.look_up(SCHEMAS["robot"])())
         page.append(f"{output}: a complete robot. Replace its numbers with yours.")
         page.append(f"{schema_file}: the keys of robot files, which editors complete and check.")
-        page.append(suggest_command("check", output))
+        following = [suggest_command("check", output)]
         if measurements is not None:
             refuse_settings_beside(measurements)
             texts[measurements] = template
             page.append(f"{measurements}: columns without rows. Fill in your measurements.")
-            page.append(suggest_command("calibrate", output, measurements, "-o", "run"))
+            following = [suggest_command("calibrate", output, measurements, "-o", "run")]
     elif family or output or measurements or report_facts is None:
         raise DataError("a new robot file needs FAMILY and -o. Give both")
     if report_facts is not None:
         texts[report_facts] = read_template()
         page.append(f"{report_facts}: facts for reports and certificates. Fill in what you know.")
-        page.append(suggest_command("report", "run", "--facts", report_facts, "--pdf"))
+        following = following or [
+            suggest_command("report", "run", "--facts", report_facts, "--pdf")
+        ]
     write_files(texts)
     written = {"robot": output, "measurements": measurements, "report_facts": report_facts}
-    return Output(written, lambda: page)
+    return Output(written, lambda: [*page, *following])
 
 
 @opt.command()

@@ -32,10 +32,11 @@ def identifiability(
     at: tuple[tuple[str, float], ...] = opt.AT,
     unknown: dict[str, Any] = opt.UNKNOWN,
     reduced: bool = opt.flag(
-        "Also choose a smallest set of parameters, and show how it contains the others.", "--reduce"
+        "Also choose parameters to fix without loss, and show how the others contain them.",
+        "--fix-unidentifiable",
     ),
     output: Path | None = opt.path(
-        "With --reduce: robot file to write, with the other parameters fixed.", "-o"
+        "With --fix-unidentifiable: robot file to write, with its 'fixed:' lines.", "-o"
     ),
     force: bool = opt.force("the output file"),
     instrument: dict[str, Any] = opt.INSTRUMENT,
@@ -65,7 +66,7 @@ def identifiability(
       loopcal identifiability hexapod-42 measurements.csv
       loopcal identifiability hexapod-42 poses.csv tracker.csv inclinometer.csv
       loopcal identifiability 3-prs --measure x,y,z,phi,theta
-      loopcal identifiability hexapod-42 --frames base,tool --reduce -o reduced.yaml
+      loopcal identifiability hexapod-42 --frames base,tool --fix-unidentifiable -o reduced.yaml
       loopcal identifiability hexapod-42 --poses poses.csv --measure x,y,z --sigma-position 5um
       loopcal identifiability hexapod-42 measurements.csv --useful 1um
     """
@@ -83,7 +84,7 @@ def identifiability(
         opt.refuse_given(opt.UNKNOWN.members, "the instrument and its unknowns", sentence)
         opt.refuse_given(("sigma_reading",), "the noise of its readings (reading_noise)", sentence)
     if output is not None and not reduced:
-        raise DataError("-o writes the robot of --reduce. Add --reduce, or leave out -o")
+        raise DataError("-o writes the robot of --fix-unidentifiable. Add this, or leave out -o")
     if useful is None and useful_angle is not None:
         raise DataError("--useful-angle belongs to --useful. Add --useful, such as --useful 1um")
     machine, drawn = opt.open_robot(robot, (output,), (*data, poses), force), []
