@@ -387,6 +387,17 @@ def test_a_report_in_place_of_the_configuration_is_named(capsys) -> None:
     assert "This is a probe report" in capsys.readouterr().err
 
 
+def test_a_wrong_height_is_named_with_the_option_that_leaves_it_out(capsys) -> None:
+    """The noise is assumed, so the wrong height makes all intervals wide."""
+    robot, truth = make_truth("m503.gcode")
+    heights = probe(robot, truth, POINTS)
+    heights[6] += 0.6
+    write_points(POINTS, heights)
+    assert run("import m503.gcode --probes report.txt -o p.yaml --data h.csv") == 0
+    assert run("calibrate p.yaml h.csv") == 0
+    assert "Hint: use --drop 7, or --loss huber" in capsys.readouterr().out
+
+
 def test_joined_logs_without_dates_are_named_as_a_cause(capsys) -> None:
     """As text of the import, and as a warning where the residuals exceed the noise."""
     robot, truth = make_truth("m503.gcode")

@@ -558,7 +558,7 @@ class CalibrationReport(DeferredFields, TableResult):
         advice = recommend_values(self.verdict, self.start, test, self.validation, self.findings)
         fitted = _count_fitted_poses(self.identification, self.split.fitted)
         outliers = tuple(f"pose {label}" for label in self.list_outliers(SEARCH_LEVEL))
-        open_codes = ("values.apply", "values.keep-not-calibrated", "values.keep-undecided")
+        open_codes = (*NEXT_WITH_VALUES, "values.apply", "values.keep-not-calibrated")
         is_open = advice.code.startswith(open_codes)
         if is_open and outliers and fitted <= FEW_POSES:
             return report_finding(LEAVE_OUT, poses=outliers)
