@@ -241,6 +241,8 @@ SOLIDS = {  # volume -> whether it has a surface, whether the robot reaches all 
         True,
         False,
     ),
+    "one point in reach": (lc.Volume({"x": (-0.5, 0.5), "y": (-0.5, 0.5)}), False, False),
+    "one point": (lc.Volume(points=[[0.0, 0.0, 0.1]]), False, True),
     "plane": (lc.Volume(radius=0.05), True, True),
     "line": (lc.Volume({"x": (-0.05, 0.05)}), False, True),
     "list": (
@@ -256,13 +258,13 @@ def test_volume_shows_its_errors_and_the_place_of_the_largest(name, linear_delta
     volume, has_surface, is_whole = SOLIDS[name]
     accuracy = lc.bound_errors(linear_delta.fit, volume)
     figure = accuracy.plot()
-    drawn, disk = figure.axes[0].collections
+    drawn, *_, disk = figure.axes[0].collections
     place = np.array([*accuracy.worst.values()])[: len(accuracy.spacing) or 3]
     assert_allclose(np.ravel(disk._offsets3d)[: len(place)], 1e3 * place, atol=1e-9)
     unit = find_unit(figure.axes[-1].get_ylabel().partition("[")[2][:-1])
     assert_allclose(np.asarray(disk.get_array()) * unit.factor_to_si, accuracy.pointwise)
     shown = drawn.get_array()
-    assert drawn.get_clim() == disk.get_clim()
+    assert drawn.get_clim() == disk.get_clim() or accuracy.points == 1
     assert disk.get_array() >= shown.max() >= shown.min() >= drawn.get_clim()[0]
     if has_surface:
         corners = np.concatenate(drawn._faces)

@@ -289,11 +289,11 @@ def draw_volume(accuracy: VolumeAccuracy) -> Figure:
 
     A solid is seen from the side of the largest bound, which a disk marks, and from the other side,
     a plane from above. Its axes are up to three coordinates, positions before angles; of the others
-    the largest bound counts. Cells with a corner out of reach are left out. A list is points.
+    the largest bound counts. Points are a list, and what no cell contains that is in reach.
     """
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
-    robot, is_grid = accuracy.robot, bool(accuracy.spacing)
+    robot = accuracy.robot
     names = [name for name in robot.controlled if name in (accuracy.spacing or accuracy.worst)]
     names = ([name for name in names if name in POSITION] or names)[:3]
     units, count = [_unit_of(name) for name in names], len(names)
@@ -302,7 +302,7 @@ def draw_volume(accuracy: VolumeAccuracy) -> Figure:
     points[..., :count] /= [of_name.factor_to_si for of_name in units]
     values, flat = values / unit.factor_to_si, points.reshape(-1, 3)
     worst, extent = flat[np.nanargmax(values)], np.ptp(flat, axis=0)
-    thin = extent.max() * np.array([0.3, 0.3, 1e-3])  # axes that the volume does not have
+    thin = (extent.max() or 1.0) * np.array([0.3, 0.3, 1e-3])  # axes that the volume does not have
     x, y, _ = worst - (flat.min(axis=0) + extent / 2.0)
     side = np.degrees(np.arctan2(y, x)) + ASIDE
     views = [(UP, side), (UP, side + 180.0)] if count > 2 else [(90.0, -90.0)]
@@ -315,13 +315,15 @@ def draw_volume(accuracy: VolumeAccuracy) -> Figure:
     for axes, view, title in zip(panels[0], views, words, strict=False):
         axes.view_init(*view)
         axes.set_title(title if count > 2 else "disk: the largest error", fontsize=LABEL)
-        if is_grid and count > 1:
-            faces, of_faces = _list_faces(points, values, *np.radians(view))
+        faces, of_faces = _list_faces(points, values, *np.radians(view))
+        if len(faces):
             surface = Poly3DCollection(faces, array=of_faces, lw=0.4, **colors)
             axes.add_collection3d(surface)
             surface.set_edgecolor("face")
-        else:
-            axes.scatter(*flat.T, c=values.ravel(), depthshade=False, **colors)
+        if not len(faces) or np.isnan(values).any():  # also what no cell contains
+            known = np.isfinite(values.ravel())
+            style = {"c": values.ravel()[known], "depthshade": False, "zorder": 0}
+            axes.scatter(*flat[known].T, **style, **colors)
         all_axes = (axes.xaxis, axes.yaxis, axes.zaxis)
         for name, of_name, axis in zip(names, units, all_axes, strict=False):
             axis.set_label_text(f"{name} [{of_name.symbol}]", fontsize=LABEL)
@@ -349,7 +351,8 @@ def _list_solid(accuracy: VolumeAccuracy, names: Sequence[str]) -> tuple[FloatAr
     if spans:
         low, high = spans[names[0]]
         cells = round((high - low) / accuracy.spacing[names[0]])
-        finer = 1 + cells * (max(1, CELLS // cells) if len(spans) <= len(names) else 1)
+        is_smooth = len(spans) <= len(names) and np.isfinite(values).all()
+        finer = 1 + cells * (max(1, CELLS // cells) if is_smooth else 1)
         sizes = {name: len(of) for name, of in volume.list_values(robot).items()}
         values = values.reshape([*(sizes | dict.fromkeys(spans, cells + 1)).values()])
         others = tuple(i for i, name in enumerate(sizes) if name not in names)
