@@ -17,7 +17,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -51,9 +51,6 @@ from loopcal.results.result import Result
 from loopcal.results.tables import choose_unit, to_quantity
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import Dimension, parse_quantity
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 LENGTH = Dimension.LENGTH
 CONDITIONS = "accuracy.volume-conditions"  # code of what reports add to the bound
@@ -290,9 +287,7 @@ class VolumeAccuracy(Result):
         Field("conformity", is_optional=True),
     )
 
-    def plot(self) -> Figure:
-        """Draw the volume in the colors of the error at each of its points."""
-        return draw(self)
+    plot = draw  # in the colors of the error at each point
 
 
 def bound_errors(
