@@ -9,12 +9,14 @@ as a Python string would, such as `\x1b`.
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import re
 import unicodedata
 from typing import Any
 
 SHOWN = 40  # characters of another's text that a message quotes
+SHOWN_FIELD = 60  # characters of a field that a representation shows
 
 _NOT_PLAIN = re.compile(
     "["
@@ -78,6 +80,34 @@ def quote(value: Any) -> str:
     text = value if is_text else repr(value)
     text = text if len(text) <= SHOWN else text[:SHOWN] + "…"
     return escape(repr(text) if is_text else text)
+
+
+def list_changes(value: Any) -> dict[str, Any]:
+    """Return the fields of a dataclass, by name, that are not as they are by default."""
+    changes = {}
+    for entry in dataclasses.fields(value):
+        if entry.init:
+            content, factory = getattr(value, entry.name), entry.default_factory
+            usual = entry.default if factory is dataclasses.MISSING else factory()
+            if content is not usual and repr(content) != repr(usual):
+                changes[entry.name] = content
+    return changes
+
+
+def represent(self: Any) -> str:
+    """Return the name of a dataclass and its `list_changes` on one line, such as
+    `Prior(names=<42 entries>, rows=<42 x 42 array>)`: only the size of what is long. This is the
+    `__repr__` of values with arrays.
+    """
+    shown = []
+    for name, content in list_changes(self).items():
+        text = repr(content)
+        if len(text) > SHOWN_FIELD or "\n" in text:
+            size = " x ".join(map(str, getattr(content, "shape", ())))
+            count = f"{len(content)} entries" if isinstance(content, tuple | list | dict) else ""
+            text = f"<{f'{size} array' if size else count or type(content).__name__}>"
+        shown.append(f"{name}={text}")
+    return f"{type(self).__name__}({', '.join(shown)})"
 
 
 def name_character(character: str) -> str:

@@ -180,7 +180,7 @@ def test_provenance_words_options_and_method_without_python(document) -> None:
 
 def test_stored_options_are_worded() -> None:
     fit = lc.FitOptions(noise="estimated", loss=lc.Huber(2.0)).to_dict()
-    options = {"fit": fit, "seed": 3, "prior": {"object": "<Posterior of x: 3 parameters>"}}
+    options = {"fit": fit, "seed": 3, "prior": {"object": "Posterior(places=<3 array>)"}}
     options["limit_position"] = 0.015 * 1e-3  # 1.4999999999999999e-05
     assert list_options(options | {"choose_model": True, "compare_with": None}) == [
         ("option: loss", "huber (k 2)"),

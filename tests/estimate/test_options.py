@@ -86,7 +86,7 @@ def test_repr_of_options_shows_changed_values_and_options_copy_arrays() -> None:
     options = FitOptions(LeastSquares(), noise="estimated", excluded_poses=["6"], start=start)
     start[0] = 1.0
     assert repr(options) == (
-        "FitOptions(method=LeastSquares(), noise='estimated', start=<(3,) array>, "
+        "FitOptions(method=LeastSquares(), noise='estimated', start=array([0., 0., 0.]), "
         "excluded_poses=('6',))"
     )
     assert np.array_equal(np.asarray(options.start), np.zeros(3))

@@ -47,7 +47,6 @@ from loopcal.estimate.posterior import NOISE, Posterior, combine_degrees
 from loopcal.estimate.residual_test import LEVEL, coverage_factor
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding
-from loopcal.findings.wording import round_to_digits
 from loopcal.measure.instrument import Instrument
 from loopcal.measure.simulation import Trials, sample_truth, simulate_trials
 from loopcal.mechanism.assembly import AXES, TWIST_UNITS
@@ -79,7 +78,7 @@ class PoseDegrees(NamedTuple):
     orientation: FloatArray
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class PoseUncertainty(TableResult):
     """Uncertainty of n poses.
 
@@ -114,16 +113,6 @@ class PoseUncertainty(TableResult):
     def frame(self) -> str:
         """Point, axes and frame in words."""
         return str(self.reference)
-
-    def __repr__(self) -> str:
-        position, angle = (
-            float(np.nanmax(values)) if np.isfinite(values).any() else float("nan")
-            for values in (self.position, self.orientation)
-        )
-        return (
-            f"PoseUncertainty of {len(self.T)} poses: at most {round_to_digits(1e3 * position)} mm "
-            f"and {round_to_digits(1e3 * angle)} mrad (rms); {self.frame}"
-        )
 
     @property
     def sd(self) -> FloatArray:

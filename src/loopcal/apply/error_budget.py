@@ -44,7 +44,7 @@ from loopcal.estimate.posterior import DISCREPANCY, INFLATION, NOISE, TOLERANCES
 from loopcal.estimate.problem import Problem
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, Quantity, report_finding
-from loopcal.findings.wording import choose_symbol, round_to_digits
+from loopcal.findings.wording import choose_symbol
 from loopcal.measure.array_checks import drop_repeats
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations, StatedSize, find_size
@@ -506,7 +506,7 @@ class SourceBudget:
     halved: HalvedErrors | None
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class ErrorBudget(DrawnResult):
     """The uncertainty of the parameters and of poses over the workspace, by source.
 
@@ -562,13 +562,6 @@ class ErrorBudget(DrawnResult):
         data = self.finding.data
         errors = tuple(data[name][0] for name in LENGTHS if data[name])
         return report_finding("accuracy.typical", **{**data, "errors": errors})
-
-    def __repr__(self) -> str:
-        position, orientation = 1e3 * self.position.rms, 1e3 * self.orientation.rms
-        return (
-            f"<ErrorBudget: {len(self.lines)} sources; position {round_to_digits(position)} mm, "
-            f"orientation {round_to_digits(orientation)} mrad>"
-        )
 
     def _describe(self, kind: str) -> dict[str, Any]:
         """Return the errors of a kind for JSON, with their effective degrees of freedom.

@@ -106,7 +106,7 @@ class VisitedPose:
         }
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Repeatability(DrawnResult):
     """Pose accuracy and repeatability of a machine.
 
@@ -160,10 +160,6 @@ class Repeatability(DrawnResult):
                     for component, accuracy, repeatability in rows
                 ]
         return listed
-
-    def __repr__(self) -> str:
-        counts = (f"{name} of {len(poses)} visited poses" for name, poses in self.poses.items())
-        return f"<Repeatability: {', '.join(counts)}>"
 
 
 def assess_repeatability(

@@ -29,6 +29,7 @@ from loopcal.findings import Finding, report_finding
 from loopcal.measure.measurements import Measurements
 from loopcal.mechanism.model import Mechanism
 from loopcal.numerics.statistics import compute_single_level
+from loopcal.plain_text import represent
 from loopcal.results.description import Field, fields, label_axes
 from loopcal.results.result import DrawnResult
 from loopcal.typing import BoolArray, FloatArray
@@ -88,8 +89,7 @@ class PairComparison:
         "finding",
     )
 
-    def __repr__(self) -> str:
-        return f"<PairComparison: {self.finding}>"
+    __repr__ = represent
 
     def find_shift(self, name: str) -> tuple[float, float, bool]:
         """Return a parameter's shift, its sd [SI], and whether it is significant; NaN untested."""

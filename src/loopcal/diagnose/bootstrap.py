@@ -491,7 +491,7 @@ FEW_BLOCKS = 12
 WEBB = np.sqrt([0.5, 1.0, 1.5])  # sizes of the six values +/-
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Bootstrap(TableResult):
     """Estimates of T resamples of one calibration. Arrays over parameters are (p,) as in the fit.
 
@@ -524,11 +524,6 @@ class Bootstrap(TableResult):
         Field("estimate", "draws", "draw parameter", units="fit.free_parameters.dimensions"),
     )
     LABELS: ClassVar[Mapping[str, Any]] = label_axes(parameter="fit.names")
-
-    def __repr__(self) -> str:
-        """Return scheme, blocks and number of resamples."""
-        blocks = f"{self.blocks.count} {self.blocks.unit}s"
-        return f"<Bootstrap: {len(self.draws)} resamples of {blocks}, scheme {self.scheme}>"
 
     @property
     def is_known(self) -> BoolArray:

@@ -46,7 +46,6 @@ from loopcal.estimate.penalties import (
 )
 from loopcal.estimate.problem import problem_of
 from loopcal.findings import Finding, report_finding
-from loopcal.findings.wording import round_to_digits
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.readings import fill_in_reading_sigma
 from loopcal.mechanism.model import Mechanism
@@ -58,7 +57,7 @@ from loopcal.typing import FloatArray, IntArray, Progress, report_no_progress
 from loopcal.units import Dimension
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class CrossValidation(TableResult):
     """Prediction errors of poses by fits that did not use them.
 
@@ -104,11 +103,6 @@ class CrossValidation(TableResult):
         """Return the factor by which a statistic of the held-out error became smaller."""
         after = getattr(self.after.statistics(index), statistic)
         return getattr(self.before.statistics(index), statistic) / after if after > 0.0 else np.inf
-
-    def __repr__(self) -> str:
-        error = round_to_digits(self.standard_error, 2)
-        score = f"score {round_to_digits(self.score, 4)} (standard error {error})"
-        return f"<CrossValidation: {len(self.fold)} folds, {len(self.poses)} rows, {score}>"
 
 
 def draw_folds(data: Measurements, count: int, seed: int) -> tuple[IntArray, ...]:
@@ -312,7 +306,7 @@ class Candidate:
 SHOWN = ("rank", "condition", "score", "standard_error")  # columns of tables, in this order
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class ModelChoice(TableResult):
     """The comparison of sets of free parameters.
 
@@ -365,9 +359,6 @@ class ModelChoice(TableResult):
             best_parameters=len(self.best.parameters),
             not_compared=tuple(c.name for c in self.candidates if c.validation is None),
         )
-
-    def __repr__(self) -> str:
-        return f"<ModelChoice: {self.chosen.name} of {', '.join(c.name for c in self.candidates)}>"
 
     def __str__(self) -> str:
         return f"{self.compare_sets().to_text()}\n{self.finding}"
@@ -523,7 +514,7 @@ class RegularizationCurve:
         return float(self.score[i]), float(self.standard_error[i])
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class RegularizationCurves(DrawnResult):
     """How the error at held-out poses depends on regularization.
 
@@ -559,12 +550,6 @@ class RegularizationCurves(DrawnResult):
             value = getattr(curve, name)
             joined += [value] * len(curve.values) if isinstance(value, str) else list(value)
         return joined
-
-    def __repr__(self) -> str:
-        return (
-            f"<RegularizationCurves of {self.robot}: {len(self.ridge.values)} values of lam, "
-            f"{len(self.truncation.values)} of k, {self.scheme}>"
-        )
 
 
 def compute_regularization_curves(

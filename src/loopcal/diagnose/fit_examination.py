@@ -42,6 +42,7 @@ from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.transmission import SOURCE, find_fixed_rows, transmit_readings
 from loopcal.numerics.elimination import find_connected_groups
 from loopcal.numerics.statistics import compute_f_tail, find_distinct
+from loopcal.plain_text import represent
 from loopcal.results.description import Field, fields
 from loopcal.results.result import Result
 from loopcal.results.tables import Block, choose_unit, to_quantity
@@ -186,14 +187,12 @@ class FitExamination(Result):
         findings="findings",
     )
 
+    __repr__ = represent
+
     def page(self) -> list[Block]:
         """Return the findings."""
         lines = (f"{f.severity.value}: {f}" for f in self.findings)
         return ["\n".join(lines) or "no findings"]
-
-    def __repr__(self) -> str:
-        names = ", ".join(finding.code for finding in self.findings) or "none"
-        return f"<FitExamination: findings: {names}>"
 
     @property
     def findings(self) -> tuple[Finding, ...]:

@@ -591,7 +591,7 @@ class MergedParameter(Result):
         return effect(vars(self), most)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class IdentifiableSubset(Result):
     """A set of free parameters that carries all information of the measurements.
 
@@ -615,9 +615,6 @@ class IdentifiableSubset(Result):
             return (report_finding("model.not-reducible", total=total),)
         summary = report_finding("model.reduced", kept=kept, total=total, condition=self.condition)
         return (summary, *(merged.finding for merged in self.dropped))
-
-    def __repr__(self) -> str:
-        return f"<IdentifiableSubset: {len(self.kept)} kept, {len(self.dropped)} fixed>"
 
 
 def choose_identifiable_subset(identifiability: Identifiability) -> IdentifiableSubset:

@@ -41,7 +41,6 @@ from loopcal.estimate.resampling import repeat_trial, resample_rows
 from loopcal.estimate.residual_test import LEVEL, coverage_factor
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
-from loopcal.findings.wording import round_to_digits
 from loopcal.measure.measurements import Measurements
 from loopcal.numerics.decomposition import NULL_COMPONENT, Decomposition
 from loopcal.numerics.statistics import compute_f_quantile, compute_f_tail, compute_single_level
@@ -114,7 +113,7 @@ FALSE_ALARMS = 0.01
 ENDS = ("lower", "upper", "linear_lower", "linear_upper")
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Intervals(TableResult):
     """Intervals of parameters; arrays are (p,) [SI], NaN where the data determine none.
 
@@ -145,11 +144,6 @@ class Intervals(TableResult):
         Field("linear_is_off", "is_off", "parameter"),
     )
     LABELS: ClassVar[Mapping[str, Any]] = label_axes(parameter="names")
-
-    def __repr__(self) -> str:
-        """Return the number of parameters, and how many linear intervals are off."""
-        off = int(self.is_off.sum())
-        return f"<Intervals by {self.source}: {len(self.names)} parameters, {off} linear ones off>"
 
     @property
     def is_off(self) -> BoolArray:
@@ -233,7 +227,7 @@ BATCH = 10_000
 SMALLEST = 1e-10  # eigenvalue of a correlation matrix below which quantities depend on each other
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class JointRegion(TableResult):
     """An ellipsoid of q quantities.
 
@@ -260,9 +254,6 @@ class JointRegion(TableResult):
         Field("covariance", axes=f"quantity {OTHER}", unit="SI times SI"),
     )
     LABELS: ClassVar[Mapping[str, Any]] = label_axes(quantity="names", other="names")
-
-    def __repr__(self) -> str:
-        return f"<JointRegion of {', '.join(self.names)}: {round_to_digits(100 * self.level, 4)} %>"
 
     @property
     def standard_deviations(self) -> FloatArray:
@@ -311,7 +302,7 @@ class JointRegion(TableResult):
         return compute_f_tail(q, self.degrees, self.measure_distance(values) / q)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class SimultaneousIntervals(TableResult):
     """Intervals that hold for all q quantities at once with a probability.
 
@@ -335,10 +326,6 @@ class SimultaneousIntervals(TableResult):
         *(Field(name, axes="quantity", unit="SI") for name in ("center", "half_widths", "single")),
     )
     LABELS: ClassVar[Mapping[str, Any]] = label_axes(quantity="names")
-
-    def __repr__(self) -> str:
-        names = f"{len(self.names)} quantities at {round_to_digits(100 * self.level, 4)} %"
-        return f"<SimultaneousIntervals of {names} by {self.rule}>"
 
     def contains(self, values: FloatArray) -> np.ndarray:
         """Return whether all of values (.., q) [SI] lie in their intervals."""

@@ -471,7 +471,7 @@ class Conflict:
         return report_finding("outliers.conflict", poses=self.poses, factor=self.times)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class OutlierCheck(TableResult):
     """The result for all blocks.
 
@@ -540,9 +540,6 @@ class OutlierCheck(TableResult):
             return self.summary
         details = [result.finding for result in (*self.outliers, *self.ambiguous)]
         return (*self.summary, *details)
-
-    def __repr__(self) -> str:
-        return f"<OutlierCheck: {len(self.outliers)} of {self.blocks} blocks are outliers>"
 
 
 def find_outliers(

@@ -30,7 +30,6 @@ from loopcal.estimate.posterior import Posterior
 from loopcal.estimate.residual_test import SIGNIFICANCE
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
-from loopcal.findings.wording import round_to_digits
 from loopcal.geometry import align_point_sets, log_so3
 from loopcal.measure.instrument import make_random_stream
 from loopcal.mechanism.inverse import inverse_trials
@@ -101,7 +100,7 @@ LEAST_PART = 0.3
 EQUAL = 1e-6
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class ValueComparison(DeferredFields, TableResult):
     """A fit against given values of its parameters; arrays (k,) in the order of `names`.
 
@@ -200,13 +199,6 @@ class ValueComparison(DeferredFields, TableResult):
     @property
     def _excluded(self) -> tuple[dict[str, object], ...]:
         return tuple(dict(combination.finding.data) for combination in self.dropped)
-
-    def __repr__(self) -> str:
-        return (
-            f"<ValueComparison: {len(self.names)} parameters, {self.degrees} directions, "
-            f"chi-square {round_to_digits(self.chi_square, 4)} "
-            f"(p = {round_to_digits(self.p_value, 2)}), rms {round_to_digits(self.rms)} spreads>"
-        )
 
 
 def compare_with_truth(fit: Identification, truth: ArrayLike) -> ValueComparison:

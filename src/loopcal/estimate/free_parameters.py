@@ -23,6 +23,7 @@ from loopcal.findings import Finding, Quantity, report_finding
 from loopcal.mechanism.model import Mechanism, ParameterUnits
 from loopcal.mechanism.over_constraint import refuse_breaking_parameters
 from loopcal.parameters import Parameter
+from loopcal.plain_text import represent
 from loopcal.results.description import Field, fields
 from loopcal.results.result import Result
 from loopcal.typing import BoolArray, FloatArray, IntArray
@@ -59,10 +60,7 @@ class FreeParameters:
     def __len__(self) -> int:
         return len(self.places) + (0 if self.errors is None else self.errors.count)
 
-    def __repr__(self) -> str:
-        """Return the robot's name and the number of free parameters."""
-        total = len(self.robot.parameters)
-        return f"<FreeParameters of {self.robot.name}: {len(self)} of {total}>"
+    __repr__ = represent
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:

@@ -213,7 +213,7 @@ def identify(
     return analysis.identification()
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class IdentifiedTrials(TableResult):
     """t machines identified at once; arrays are (t, ...), SI.
 
@@ -245,13 +245,6 @@ class IdentifiedTrials(TableResult):
         ),
     )
     LABELS: ClassVar[Mapping[str, Any]] = label_axes(parameter="free_parameters.names")
-
-    def __repr__(self) -> str:
-        """Return the number of trials and how many converged."""
-        return (
-            f"<IdentifiedTrials of {self.free_parameters.robot.name}: {len(self.values)} trials of "
-            f"{len(self.free_parameters)} parameters, {int(self.converged.sum())} converged>"
-        )
 
     @cached_property
     def decomposition(self) -> Decomposition:

@@ -27,6 +27,7 @@ from loopcal.estimate.residual_test import SIGMA_UNCERTAINTY
 from loopcal.measure.array_checks import check_type
 from loopcal.measure.nuisance import NuisanceParameters
 from loopcal.numerics.decomposition import RANK_TOLERANCE
+from loopcal.plain_text import list_changes, represent
 from loopcal.registry import Registry
 from loopcal.typing import FloatArray
 
@@ -124,15 +125,7 @@ class FitOptions(Limited):
             start.setflags(write=False)
             object.__setattr__(self, "start", start)
 
-    def __repr__(self) -> str:
-        """Return the options that differ from their defaults."""
-        shown = []
-        for entry in fields(self):
-            value = getattr(self, entry.name)
-            if not _is_default(value, entry):
-                text = f"<{value.shape} array>" if isinstance(value, np.ndarray) else repr(value)
-                shown.append(f"{entry.name}={text}")
-        return f"FitOptions({', '.join(shown)})"
+    __repr__ = represent
 
     def to_dict(self) -> dict[str, Any]:
         """Return the options as plain data, which `from_dict` reads.
@@ -234,11 +227,7 @@ def _list_settings(value: Any) -> dict[str, Any]:
     """Return the fields of a dataclass that differ from their defaults, as plain data."""
     if not dataclasses.is_dataclass(value):
         return {}
-    return {
-        entry.name: _to_plain(getattr(value, entry.name))
-        for entry in fields(value)
-        if entry.init and not _is_default(getattr(value, entry.name), entry)
-    }
+    return {name: _to_plain(content) for name, content in list_changes(value).items()}
 
 
 def _from_plain(value: Any) -> Any:
@@ -294,12 +283,3 @@ def check_labels(option: str, labels: Sequence[str]) -> tuple[str, ...]:
     for label in given:
         check_type(label, str, option, f"the label of a pose, such as '{label}'")
     return given
-
-
-def _is_default(value: Any, entry: dataclasses.Field[Any]) -> bool:
-    """Return whether a field has its default value."""
-    if entry.default_factory is not dataclasses.MISSING:
-        return value == entry.default_factory()
-    return value is entry.default or (
-        isinstance(value, str | float | tuple) and value == entry.default
-    )

@@ -20,12 +20,12 @@ from loopcal.estimate.penalties import Method
 from loopcal.estimate.residual_test import FEWEST_DEGREES, ResidualTest
 from loopcal.estimate.smooth_errors import SmoothErrors
 from loopcal.findings import report_finding
-from loopcal.findings.wording import round_to_digits
 from loopcal.measure.fitted_rows import FittedRows, fitted_rows_from_arrays
 from loopcal.measure.kinds.setup_parameters import POSITION_AXES, ROTATION_AXES, linearize_frame
 from loopcal.mechanism.model import Mechanism
 from loopcal.numerics.decomposition import Decomposition
 from loopcal.numerics.statistics import find_distinct
+from loopcal.plain_text import represent
 from loopcal.results.description import Field
 from loopcal.results.storage import restore_arrays, store_arrays
 from loopcal.typing import BoolArray, FloatArray, IntArray
@@ -123,9 +123,7 @@ class DataInformation:
     variance: float
     degrees: float
 
-    def __repr__(self) -> str:
-        """Return the numbers of rows and parameters."""
-        return f"<DataInformation: {len(self.rows)} rows on {self.rows.shape[1]} parameters>"
+    __repr__ = represent
 
 
 def describe_information(
@@ -182,14 +180,7 @@ class ModelDiscrepancy:
     left: FloatArray
     is_corrected: bool = False
 
-    def __repr__(self) -> str:
-        """Return the amplitudes."""
-        sizes = 1e3 * np.linalg.norm(self.errors.amplitude, axis=0)
-        stated = [
-            f"{round_to_digits(sizes[own].max())} {'mm' if is_place else 'mrad'}"
-            for is_place, own, _ in self.parts
-        ]
-        return f"<ModelDiscrepancy: {' and '.join(stated)}>"
+    __repr__ = represent
 
     @property
     def parts(self) -> list[tuple[bool, BoolArray, FloatArray]]:
@@ -274,10 +265,7 @@ class FrameKnowledge:
     readings: FloatArray
     instruments: Mapping[str, InstrumentFrame] = field(default_factory=dict)
 
-    def __repr__(self) -> str:
-        """Return the number of motions and the names of the frames."""
-        names = ", ".join(self.instruments) or "none"
-        return f"<FrameKnowledge: {self.unfixed.shape[1]} unfixed motions; instruments: {names}>"
+    __repr__ = represent
 
     def add_errors(
         self, names: Sequence[str], values: FloatArray, errors: FloatArray
@@ -369,12 +357,7 @@ class Posterior:
         Field("seen", "determined", is_stored=True),
     )
 
-    def __repr__(self) -> str:
-        """Return the robot's name and the numbers of parameters and of determined directions."""
-        return (
-            f"<Posterior of {self.robot.name}: {len(self.places)} parameters, "
-            f"{int(self.determined.sum())} directions determined>"
-        )
+    __repr__ = represent
 
     @property
     def names(self) -> tuple[str, ...]:

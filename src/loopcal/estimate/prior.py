@@ -28,6 +28,7 @@ from loopcal.measure.fitted_rows import FittedRows
 from loopcal.measure.measurements import Measurements
 from loopcal.mechanism.model import Mechanism
 from loopcal.numerics.decomposition import find_null_space, intersect_spaces
+from loopcal.plain_text import represent
 from loopcal.typing import FloatArray, IntArray
 
 ELIMINATED = 1e-11
@@ -54,9 +55,7 @@ class Prior:
     unfixed: FloatArray | None = None
     fitted_rows: FittedRows | None = None
 
-    def __repr__(self) -> str:
-        """Return the numbers of rows and parameters."""
-        return f"<Prior: {len(self.rows)} rows on {len(self.names)} parameters>"
+    __repr__ = represent
 
     def added(self, problem: Problem, errors: FloatArray | None = None) -> WithPrior:
         """Return the problem of these rows and the rows of the prior, for the descent.

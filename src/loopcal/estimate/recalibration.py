@@ -41,6 +41,7 @@ from loopcal.numerics.statistics import (
     compute_f_tail,
     compute_single_level,
 )
+from loopcal.plain_text import represent
 from loopcal.results.description import Field, fields
 from loopcal.results.result import Result
 from loopcal.typing import BoolArray, FloatArray, Progress, report_no_progress
@@ -196,9 +197,7 @@ class ParameterChanges:
     # the independent parts of the noise; the sum of root root' is the unit matrix (k, k)
     errors: tuple[ErrorPart, ...]
 
-    def __repr__(self) -> str:
-        """Return the numbers of directions and parameters."""
-        return f"<ParameterChanges: {self.degrees} directions of {len(self.names)} parameters>"
+    __repr__ = represent
 
     @property
     def degrees(self) -> int:

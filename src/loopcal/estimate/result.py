@@ -47,6 +47,7 @@ from loopcal.numerics.decomposition import Decomposition, are_nonzero
 from loopcal.numerics.elimination import UnknownRoot
 from loopcal.numerics.gauss_newton import DescentStatus
 from loopcal.parameters import ParameterTable
+from loopcal.plain_text import represent
 from loopcal.results.deferred import DeferredFields, deferred, later
 from loopcal.results.description import OTHER, Field, Source, fields, label_axes
 from loopcal.results.presenters import draw
@@ -98,9 +99,7 @@ class KindResiduals:
         Field("rows", "poses", is_stored=True),
     )
 
-    def __repr__(self) -> str:
-        """Return the kind and the size of the residuals."""
-        return f"<KindResiduals of {self.kind}: {len(self.raw)} rows of {len(self.components)}>"
+    __repr__ = represent
 
 
 _NAME = re.compile(r"residual_(\d+)_(.+)", re.DOTALL)
@@ -297,9 +296,7 @@ class History:
         """How the iteration ended."""
         return report_finding(STATUS_CODES[self.status], iterations=self.iterations)
 
-    def __repr__(self) -> str:
-        """Return the status and the number of iterations."""
-        return f"<History: {self.status.name.lower()} after {self.iterations} steps>"
+    __repr__ = represent
 
 
 @dataclass(frozen=True, eq=False)
@@ -736,9 +733,7 @@ class NuisanceEstimate(TableResult):
     def __len__(self) -> int:
         return len(self.table)
 
-    def __repr__(self) -> str:
-        owners = ", ".join(_owners(self.names)) or "none"
-        return f"<NuisanceEstimate: {len(self)} setup parameters ({owners})>"
+    __repr__ = represent
 
     def __str__(self) -> str:
         """Return one line for each: name, estimate and standard deviation in its unit."""

@@ -18,6 +18,7 @@ import numpy as np
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.readings import find_steps
 from loopcal.numerics.statistics import binomial_tail
+from loopcal.plain_text import represent
 from loopcal.typing import BoolArray, FloatArray
 
 SAME = 1e-8  # share of what a column spans up to which two numbers are the same
@@ -177,9 +178,7 @@ class FittedRows:
         """Return the number of rows."""
         return sum(len(content) for _, content in self.groups)
 
-    def __repr__(self) -> str:
-        kinds = ", ".join(dict.fromkeys(kind for kind, _ in self.groups))
-        return f"<FittedRows: {len(self)} rows{f' of {kinds}' if kinds else ''}>"
+    __repr__ = represent
 
     def joined(self, other: FittedRows) -> FittedRows:
         """Return these rows and those of another calibration."""

@@ -24,6 +24,7 @@ from loopcal.measure.kinds.kind import Kind, measure_progress
 from loopcal.measure.nuisance import StatedValue
 from loopcal.measure.observations import TextArray, check_labels, check_poses, check_rows
 from loopcal.mechanism.model import Mechanism
+from loopcal.plain_text import represent
 from loopcal.typing import FloatArray, IntArray
 from loopcal.units import SD_RANGE, Dimension, is_sd
 
@@ -78,8 +79,7 @@ class Gaussian(Noise):
         _check_positive(stated, what)
         set_fields(self, sd=sd)
 
-    def __repr__(self) -> str:
-        return f"Gaussian({self.sd.tolist()}{f', {dict(self.sight)}' if self.sight else ''})"
+    __repr__ = represent
 
     @property
     def sigma(self) -> FloatArray:
@@ -102,8 +102,7 @@ class Uniform(Noise):
     def __post_init__(self) -> None:
         set_fields(self, limit=_check_positive(self.limit, "the limits of the noise"))
 
-    def __repr__(self) -> str:
-        return f"Uniform({self.limit.tolist()})"
+    __repr__ = represent
 
     @property
     def sigma(self) -> FloatArray:
@@ -179,9 +178,7 @@ class Sensor:
                 f"one for each of {names}"
             )
 
-    def __repr__(self) -> str:
-        rows = "" if self.rows is None else f", {len(self.rows)} rows"
-        return f"Sensor({self.kind!r}, {self.noise!r}{rows})"
+    __repr__ = represent
 
     def assign_rows(self, n_poses: int) -> Self:
         """Return the sensor with explicit rows, sessions and groups for n poses; DataError where a

@@ -20,6 +20,7 @@ from loopcal.measure.kinds.kind import Kind
 from loopcal.measure.observations import Observations, StatedSize
 from loopcal.mechanism.model import Mechanism
 from loopcal.parameters import Parameter, ParameterTable
+from loopcal.plain_text import represent
 from loopcal.typing import FloatArray, IntArray
 from loopcal.units import SD_RANGE, UNITS, Dimension, Unit, is_sd
 
@@ -83,10 +84,7 @@ class NuisanceParameters:
     def __len__(self) -> int:
         return len(self.table)
 
-    def __repr__(self) -> str:
-        names = self.table.names
-        more = f" and {len(names) - 12} more" if len(names) > 12 else ""
-        return f"NuisanceParameters({len(names)}: {', '.join(names[:12])}{more})"
+    __repr__ = represent
 
     def select(self, kind: int, values: FloatArray) -> FloatArray:
         """Return values (t, r, u) for the rows of one kind, from those of all parameters (t, U)."""

@@ -63,9 +63,6 @@ class Modes(Result):
             f"{self.starts_since_new}{rarest}"
         )
 
-    def __repr__(self) -> str:
-        return f"<Modes: {self}>"
-
 
 @dataclass(frozen=True, eq=False)
 class _Problem:

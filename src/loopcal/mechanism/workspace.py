@@ -15,7 +15,6 @@ from loopcal import geometry
 from loopcal.engine import State
 from loopcal.errors import MechanismError
 from loopcal.findings import report_finding
-from loopcal.findings.wording import round_to_digits
 from loopcal.mechanism.kinematics import compute_limb_frames
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.solutions import Solution, inverse, make_solution
@@ -99,7 +98,7 @@ def check_limits(
     return allowed, findings
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class WorkspaceSample(Result):
     """Positions drawn at random from a workspace.
 
@@ -112,10 +111,6 @@ class WorkspaceSample(Result):
     solution: Solution
     reachable_share: float
     rejected: Mapping[str, int]
-
-    def __repr__(self) -> str:
-        share = f"{round_to_digits(100 * self.reachable_share)} % of the stated workspace"
-        return f"<WorkspaceSample of {len(self.coordinates)} positions; {share} is reachable>"
 
 
 def sample_workspace(

@@ -25,6 +25,7 @@ from loopcal.measure.kinds.setup_parameters import POSITION_AXES, ROTATION_AXES
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import list_dimensions
 from loopcal.mechanism.solutions import inverse
+from loopcal.plain_text import represent
 from loopcal.planning.candidates import list_steps
 from loopcal.planning.constraints import N_POSES, PlanOptions
 from loopcal.planning.design_space import Criterion, is_allowed
@@ -68,8 +69,7 @@ class PlannedPoses:
     def __len__(self) -> int:
         return len(self.labels)
 
-    def __repr__(self) -> str:
-        return f"PlannedPoses({len(self)} poses, {int(self.held_out.sum())} held out)"
+    __repr__ = represent
 
     @property
     def uses(self) -> tuple[str, ...]:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from loopcal.environment import import_optional
 from loopcal.findings import Finding, Severity
+from loopcal.plain_text import represent
 from loopcal.results.description import Field, Records, Source, collect_records
 from loopcal.results.presenters import draw, find_presenter
 from loopcal.results.serialization import json_fields
@@ -47,14 +48,16 @@ class Result:
     def __str__(self) -> str:
         """Return the registered page as text, without one the findings, one on each line.
 
-        A result without a page and without findings is its representation.
+        A result without a page and without findings is its fields.
         """
         from loopcal.results.tables import render_text
 
         own_page = find_presenter("page", type(self))
         if own_page is not None:
             return render_text(own_page(self), UNBROKEN)
-        stated = getattr(self, "findings", ()) or (getattr(self, "finding", None) or repr(self),)
+        stated = getattr(self, "findings", ()) or (
+            getattr(self, "finding", None) or represent(self),
+        )
         return "\n".join(map(str, stated))
 
     def __repr__(self) -> str:  # of dataclasses with `repr=False`, which have a text or a page

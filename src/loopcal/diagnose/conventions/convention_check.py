@@ -45,7 +45,6 @@ from loopcal.diagnose.conventions.misfit import (
 from loopcal.errors import DataError
 from loopcal.estimate.free_parameters import FreeParameters, select_free_parameters
 from loopcal.findings import Finding, Severity, report_finding
-from loopcal.findings.wording import round_to_digits
 from loopcal.measure.data_checks import (
     check_actuators,
     check_targets_move,
@@ -67,7 +66,7 @@ from loopcal.results.result import Result
 IMPLAUSIBLE = 10.0
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class ConventionCheck(Result):
     """The stated conventions of measurements against the robot, and the best other interpretation.
 
@@ -106,10 +105,6 @@ class ConventionCheck(Result):
     def is_refused(self) -> bool:
         """Whether there is clear evidence that the stated conventions are wrong."""
         return self.finding is not None and self.finding.severity is Severity.REFUSAL
-
-    def __repr__(self) -> str:
-        code = "agrees" if self.finding is None else self.finding.code
-        return f"<ConventionCheck: {code}, misfit {round_to_digits(self.misfit)}>"
 
 
 def check_conventions(

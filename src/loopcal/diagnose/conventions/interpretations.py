@@ -23,6 +23,7 @@ from loopcal.measure.kinds.poses import Component, Pose
 from loopcal.measure.kinds.position import Bearing
 from loopcal.measure.measurements import Measurements
 from loopcal.mechanism.assembly import Actuator
+from loopcal.plain_text import represent
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import Dimension
 
@@ -52,8 +53,7 @@ class Interpretation:
         """Return code, source and details, for the data of another finding."""
         return {"code": f"conventions.{self.slip}", "source": self.source, **self.details}
 
-    def __repr__(self) -> str:
-        return f"<Interpretation: {self.finding}>"
+    __repr__ = represent
 
 
 def with_measured(data: Measurements, i: int, measured: FloatArray) -> Measurements:

@@ -22,7 +22,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import MISSING, Field, dataclass, field, fields, replace
+from dataclasses import Field, dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any, ClassVar, NamedTuple, Self, cast
 
@@ -36,6 +36,7 @@ from loopcal.mechanism.limb_rows import name_entries
 from loopcal.numerics.elimination import spread_columns, without_rounding
 from loopcal.numerics.statistics import find_distinct
 from loopcal.parameters import Parameter
+from loopcal.plain_text import represent
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension
 
@@ -232,19 +233,7 @@ class Kind(ABC):
                 f"{scales[0]!r}"
             )
 
-    def __repr__(self) -> str:
-        """Return the settings that differ from their defaults, on one line."""
-        changed = []
-        for setting in fields(self):
-            value, factory = getattr(self, setting.name), setting.default_factory
-            usual = cast(Any, setting.default) if factory is MISSING else factory()
-            if setting.init and not np.array_equal(value, usual):
-                text = repr(value)
-                if isinstance(value, np.ndarray):
-                    text = f"<array {value.shape}>"
-                    text = str(np.round(value, 6).tolist()) if value.size <= 16 else text
-                changed.append(f"{setting.name}={text}")
-        return f"{type(self).__name__}({', '.join(changed)})"
+    __repr__ = represent
 
     @property
     def columns(self) -> tuple[Column, ...]:

@@ -295,8 +295,8 @@ def describe_value(value: Any) -> str:
         return ", ".join(map(describe_value, value))
     if not isinstance(value, dict):
         return f"{value:.{DIGITS}g}" if isinstance(value, float) else str(value)
-    if OBJECT in value:  # `<Posterior of ...>` of Python
-        return str(value[OBJECT]).strip("<>").split(" ")[0]
+    if OBJECT in value:  # `Posterior(..)` of Python, formerly `<Posterior of ..>`
+        return re.findall(r"\w+", str(value[OBJECT]))[0]
     settings = ", ".join(
         f"{k} {describe_value(v)}" for k, v in value.items() if k != "name" and v not in EMPTY
     )
