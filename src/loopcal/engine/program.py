@@ -297,14 +297,36 @@ class Target:
     With `torsion`, R = Rz(a) Ry(b) Rz(c - a). What is not stated are the position of `base`, angles
     of zero, and without any angle the rotation of `base`.
 
-    values : (t | 1, n, c) coordinates [m, rad]. columns : those of x, y, z, a, b, c; -1 for none.
-    base : (4, 4) [m].
+    values : (.., c) coordinates [m, rad], of an engine (t | 1, n, c). columns : those of x, y, z,
+        a, b, c; -1 for none. base : (4, 4) [m].
     """
 
     values: FloatArray
     columns: tuple[int, ...]
     torsion: bool
     base: FloatArray
+
+    @property
+    def poses(self) -> FloatArray:
+        """The poses (.., 4, 4) [m]."""
+        T = np.array(np.broadcast_to(self.base, (*self.values.shape[:-1], 4, 4)))
+        none = np.zeros(T.shape[:-2])
+        at = [self.values[..., i] if i >= 0 else none for i in self.columns]
+        for axis, column in enumerate(self.columns[:3]):
+            if column >= 0:
+                T[..., axis, 3] = at[axis]
+        if max(self.columns[3:]) < 0:
+            return T
+        a, b, c = at[3], at[4], at[5] - at[3] if self.torsion else at[5]
+        (sa, sb, sc), (ca, cb, cc) = ((f(a), f(b), f(c)) for f in (np.sin, np.cos))
+        # the columns of Rz(a) Ry(b), of which the last turn combines two
+        x, y, z = (ca * cb, sa * cb, -sb), (-sa, ca, none), (ca * sb, sa * sb, cb)
+        for row, (i, j, k) in enumerate(zip(x, y, z, strict=True)):
+            turned = (cc * i + sc * j, cc * j - sc * i, k)
+            if not self.torsion:
+                turned = (i, cc * j + sc * k, cc * k - sc * j)
+            T[..., row, 0], T[..., row, 1], T[..., row, 2] = turned
+        return T
 
 
 @dataclass(frozen=True, eq=False)

@@ -39,7 +39,7 @@ from loopcal.mechanism.mobility import (
 )
 from loopcal.mechanism.model import Mechanism, SlotMap, Stage
 from loopcal.mechanism.over_constraint import report_over_constraint
-from loopcal.mechanism.platform_coordinates import compare_coordinates, read_coordinates
+from loopcal.mechanism.platform_coordinates import differentiate_coordinates, read_coordinates
 from loopcal.mechanism.sensitivity import differentiate_pose
 from loopcal.mechanism.states import driven_values, is_closed, make_start
 from loopcal.mechanism.transmission import LOAD, list_constants, name_terms, nominal_terms
@@ -556,8 +556,7 @@ def _choose_readings(robot: Mechanism, state: State, still: bool = False) -> Int
     blocks, count = linearize_state(robot, state), sums.chosen
     rows = stack_sum_rows(program, blocks, sums.weights[:, count:])[0, 0]
     if still:
-        target = read_coordinates(state.T[0], robot.controlled)
-        _, slope = compare_coordinates(state.T[0], target, robot.controlled, robot.size)
+        slope = differentiate_coordinates(state.T[0], robot.controlled, robot.size)
         own = np.zeros((len(robot.controlled), rows.shape[1]))
         own[:, : len(program.freedoms)] = slope[0][:, list(program.freedoms)]
         rows = np.concatenate([rows, own])
@@ -627,8 +626,7 @@ def _check_drives_of_pose(robot: Mechanism) -> None:
                 freedoms=freedoms,
             )
         )
-    target = read_coordinates(home.T[0], robot.controlled)
-    _, slope = compare_coordinates(home.T[0], target, robot.controlled, robot.size)
+    slope = differentiate_coordinates(home.T[0], robot.controlled, robot.size)
     rates = slope[0] / robot.twist_scale @ scaled
     independent = count_rank(rates)
     if independent < c:

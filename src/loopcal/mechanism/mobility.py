@@ -30,8 +30,7 @@ from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import (
     COORDINATES,
     check_coordinates,
-    compare_coordinates,
-    read_coordinates,
+    differentiate_coordinates,
 )
 from loopcal.mechanism.states import driven_values
 from loopcal.mechanism.transmission import select_weights
@@ -181,8 +180,7 @@ def refuse_singular_home(robot: Mechanism, state: engine.State) -> None:
 
 def _differentiate_controlled(robot: Mechanism, T: FloatArray) -> FloatArray:
     """Return d controlled coordinates / d freedoms (c, m) at a pose (4, 4)."""
-    target = read_coordinates(T[None], robot.controlled)
-    _, columns = compare_coordinates(T[None], target, robot.controlled, robot.size)
+    columns = differentiate_coordinates(T[None], robot.controlled, robot.size)
     return columns[0][:, list(robot.program.freedoms)]
 
 

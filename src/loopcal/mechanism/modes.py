@@ -64,18 +64,6 @@ class Modes(Result):
         )
 
 
-@dataclass(frozen=True, eq=False)
-class _Problem:
-    """A search for modes: how random starts are solved, numbers (n, k) that agree for equal
-    solutions only, the distance from home (n, k), and the readings (n, a) of solutions.
-    """
-
-    solve: Callable[[State], State]
-    identify: Callable[[State], FloatArray]
-    measure: Callable[[State], FloatArray]
-    read: Callable[[State], FloatArray]
-
-
 def find_assembly_modes(
     robot: Mechanism,
     q: ArrayLike,
@@ -123,8 +111,7 @@ def find_assembly_modes(
     def read(state: State) -> FloatArray:
         return np.tile(readings, (state.T.shape[1], 1))
 
-    problem = _Problem(solve, lambda state: _flatten_poses(robot, state), measure, read)
-    return _search(robot, problem, patience, max_starts, seed)
+    return _search(robot, solve, read, measure, patience, max_starts, seed)
 
 
 def find_working_modes(
@@ -171,20 +158,15 @@ def find_working_modes(
     def measure(state: State) -> FloatArray:
         return (read(state) - home) * np.where(turning, robot.size, 1.0)
 
-    def identify(state: State) -> FloatArray:
-        q = read(state)
-        angles, lengths = q[:, turning], q[:, ~turning] / robot.size
-        return np.concatenate(
-            [lengths, np.cos(angles), np.sin(angles), _flatten_poses(robot, state)], axis=1
-        )
-
-    return _search(robot, _Problem(solve, identify, measure, read), patience, max_starts, seed)
+    return _search(robot, solve, read, measure, patience, max_starts, seed)
 
 
-def _flatten_poses(robot: Mechanism, state: State) -> FloatArray:
-    """Return position over size and rotation matrix of a state (1, n), as (n, 12)."""
-    T = state.T[0]
-    return np.concatenate([T[:, :3, 3] / robot.size, T[:, :3, :3].reshape(-1, 9)], axis=1)
+def _identify(robot: Mechanism, state: State, q: FloatArray) -> FloatArray:
+    """Return numbers (n, k) that agree for equal readings q (n, a) and poses of a state (1, n)."""
+    T, turning = state.T[0], np.array([a.dimension is Dimension.ANGLE for a in robot.actuators])
+    angles, lengths = q[:, turning], q[:, ~turning] / robot.size
+    parts = lengths, np.cos(angles), np.sin(angles), T[:, :3, 3] / robot.size
+    return np.concatenate([*parts, T[:, :3, :3].reshape(-1, 9)], axis=1)
 
 
 def _subtract_turns(robot: Mechanism, state: State) -> State:
@@ -212,9 +194,18 @@ def _subtract_turns(robot: Mechanism, state: State) -> State:
 
 
 def _search(
-    robot: Mechanism, problem: _Problem, patience: int, max_starts: int, seed: int
+    robot: Mechanism,
+    solve: Callable[[State], State],
+    read: Callable[[State], FloatArray],
+    measure: Callable[[State], FloatArray],
+    patience: int,
+    max_starts: int,
+    seed: int,
 ) -> Modes:
-    """Solve batches of random starts until `patience` of them give nothing new."""
+    """Solve batches of random starts until `patience` of them give nothing new.
+
+    read, measure : the readings (n, a) of solutions, and their distance (n, k) from home.
+    """
     rng, tried, last = np.random.default_rng(seed), 0, 0
     modes, hits = select_poses(robot.home_state, np.arange(0)), np.zeros(0, np.int64)
     while tried - last < patience:
@@ -223,15 +214,15 @@ def _search(
                 f"{robot.name}: {len(hits)} modes after {tried} random starts, and still new ones; "
                 "allow more starts, or check whether the readings leave the platform free to move"
             )
-        new = problem.solve(_draw_starts(robot, rng, BATCH))
+        new = solve(_draw_starts(robot, rng, BATCH))
         new = select_poses(new, new.status[0] == Status.CONVERGED)
         before = len(hits)
-        modes, hits = _merge(modes, hits, new, problem.identify)
+        modes, hits = _merge(modes, hits, new, lambda s: _identify(robot, s, read(s)))
         tried += BATCH
         last = tried if len(hits) > before else last
-    order = np.argsort(np.linalg.norm(problem.measure(modes), axis=1))
+    order = np.argsort(np.linalg.norm(measure(modes), axis=1))
     modes = select_poses(modes, order)
-    solution = make_solution(robot, modes, problem.read(modes))
+    solution = make_solution(robot, modes, read(modes))
     return Modes(solution, hits[order], tried, tried - last)
 
 

@@ -69,24 +69,11 @@ def pose_from_coordinates(
     values: FloatArray, names: tuple[str, ...], base: FloatArray
 ) -> FloatArray:
     """Return poses (.., 4, 4) with coordinates values (.., c); all others are those of `base`."""
-    T = np.array(np.broadcast_to(base, (*values.shape[:-1], 4, 4)))
-    values, names = _add_turns(values, names, base)
-    given = {name: values[..., i] for i, name in enumerate(names)}
-    for i, name in enumerate(POSITION):
-        if name in given:
-            T[..., i, 3] = given[name]
-    zero = np.zeros(values.shape[:-1])
-    if set(names) & set(TILT):
-        angles = np.stack([given.get(name, zero) for name in TILT], axis=-1)
-        T[..., :3, :3] = geometry.tilt_torsion_to_matrix(angles)
-    if set(names) & set(EULER):
-        angles = np.stack([given.get(name, zero) for name in EULER], axis=-1)
-        T[..., :3, :3] = geometry.euler_to_matrix(angles, "xyz")
-    return T
+    return state_target(values, names, base).poses
 
 
 def state_target(values: FloatArray, names: tuple[str, ...], base: FloatArray) -> Target:
-    """Return the poses of `pose_from_coordinates` (t | 1, n, c) as the engine states them."""
+    """Return the poses of `pose_from_coordinates` as the engine states them."""
     values, names = _add_turns(values, names, base)
     turns = ("phi", "theta", "psi") if set(names) & set(TILT) else ("yaw", "pitch", "roll")
     places = {name: i for i, name in enumerate(names)}
@@ -143,6 +130,11 @@ def compare_coordinates(
                 residual[:, place] = size * geometry.wrap_angle(angles[:, i] - wanted[name])
                 columns[:, place, :3] = size * rates[:, i]
     return residual, columns
+
+
+def differentiate_coordinates(T: FloatArray, names: tuple[str, ...], size: float) -> FloatArray:
+    """Return the columns (N, c, 6) of `compare_coordinates` at the coordinates of T (N, 4, 4)."""
+    return compare_coordinates(T, read_coordinates(T, names), names, size)[1]
 
 
 def _compare_normals(

@@ -30,7 +30,7 @@ from loopcal.mechanism.kinematics import compute_closure_sign, compute_readings
 from loopcal.mechanism.limb_rows import linearize_state, reduce_to_platform
 from loopcal.mechanism.mobility import list_main_freedoms
 from loopcal.mechanism.model import Mechanism
-from loopcal.mechanism.platform_coordinates import compare_coordinates, read_coordinates
+from loopcal.mechanism.platform_coordinates import differentiate_coordinates
 from loopcal.mechanism.sensitivity import differentiate_pose
 from loopcal.mechanism.solutions import Solution, forward, inverse, make_solution
 from loopcal.mechanism.states import join_states
@@ -319,8 +319,7 @@ def _compute_chain_margins(
         direction = np.where(is_less[:, None], twist / np.maximum(length, 1e-300), direction)
     q = compute_readings(robot, values, state)
     D = differentiate_pose(robot, values, q, state).readings[0]
-    T, names = state.T[0], robot.controlled
-    _, columns = compare_coordinates(T, read_coordinates(T, names), names, robot.size)
+    columns = differentiate_coordinates(state.T[0], robot.controlled, robot.size)
     moving = find_carrying_actuators(robot)
     tau = robot.slots(values)[1]
     turned = np.abs(differentiate_by_readings(q, tau, robot.slots.constants)[0]).sum(axis=1)

@@ -40,7 +40,7 @@ from loopcal.mechanism.limb_rows import name_passive_joints
 from loopcal.mechanism.model import Mechanism, describe_gap
 from loopcal.mechanism.platform_coordinates import (
     POSITION,
-    compare_coordinates,
+    differentiate_coordinates,
     read_coordinates,
     state_target,
 )
@@ -629,9 +629,8 @@ def differentiate_by_coordinates(robot: Mechanism, values: FloatArray, state: St
     """Return d twist / d coordinate (t, n, 6, c) [1/m, 1], every actuator free, in the units of
     `compare_coordinates`.
     """
-    names, (t, n) = robot.controlled, state.T.shape[:2]
-    flat = state.T.reshape(-1, 4, 4)
-    _, columns = compare_coordinates(flat, read_coordinates(flat, names), names, robot.size)
-    columns = columns.reshape(t, n, len(names), 6)
+    names, flat = robot.controlled, state.T.reshape(-1, 4, 4)
+    columns = differentiate_coordinates(flat, names, robot.size)
+    columns = columns.reshape(*state.T.shape[:2], len(names), 6)
     D = differentiate_pose(robot, values, compute_readings(robot, values, state), state).readings
     return np.matmul(D, np.linalg.pinv(np.nan_to_num(np.matmul(columns, D))))

@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loopcal.engine.numpy_engine.certificate import certify
-from loopcal.engine.numpy_engine.closure import stack
 from loopcal.engine.numpy_engine.newton import solve
 from loopcal.engine.program import CONVERGED, NEAR_GOAL, Program, Reached, State, Target
 from loopcal.typing import FloatArray
@@ -34,7 +33,7 @@ def reach_by(
     start: State,
 ) -> Reached:
     """Return what `reach` returns by two other functions of an engine."""
-    limbs, first = program.with_fixed_platform, replace(start, T=place_platforms(target))
+    limbs, first = program.with_fixed_platform, replace(start, T=target.poses)
     state = solve(limbs, e, program.list_drives(start.joints), first, free=True)
     q = program.list_drives(state.joints)
     sign = solve(program, e, q, state, max_iterations=0).closure_sign
@@ -44,33 +43,3 @@ def reach_by(
     back = solve(program, e, np.where(open_rows[..., None], q, np.nan), start, goal=state)
     arrives = proven | (back.status == NEAR_GOAL)
     return Reached(replace(state, closure_sign=sign), arrives)
-
-
-def place_platforms(target: Target) -> FloatArray:
-    """Return the poses (t | 1, n, 4, 4) of a target."""
-    values = target.values
-    T = np.empty((*values.shape[:2], 4, 4))
-    T[:] = target.base
-    for axis, column in enumerate(target.columns[:3]):
-        if column >= 0:
-            T[..., axis, 3] = values[..., column]
-    if max(target.columns[3:]) >= 0:
-        T[..., :3, :3] = np.moveaxis(_compute_rotations(target), (0, 1), (-2, -1))
-    return T
-
-
-def _compute_rotations(target: Target) -> FloatArray:
-    """Return the rotations (3, 3, t | 1, n) of a target."""
-    none = np.zeros(target.values.shape[:2])
-    a, b, c = (
-        target.values[..., column].copy() if column >= 0 else none for column in target.columns[3:]
-    )
-    third = c - a if target.torsion else c
-    (sa, sb, sc), (ca, cb, cc) = ((f(a), f(b), f(third)) for f in (np.sin, np.cos))
-    # the columns of Rz(a) Ry(b), of which the last turn combines two
-    x, y, z = stack((ca * cb, sa * cb, -sb)), stack((-sa, ca, none)), stack((ca * sb, sa * sb, cb))
-    if target.torsion:
-        x, y = cc * x + sc * y, cc * y - sc * x
-    else:
-        y, z = cc * y + sc * z, cc * z - sc * y
-    return np.stack([x, y, z], axis=1)

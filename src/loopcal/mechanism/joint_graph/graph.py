@@ -9,13 +9,7 @@ from typing import Literal
 import numpy as np
 
 from loopcal import geometry
-from loopcal.mechanism.platform_coordinates import (
-    EULER,
-    POSITION,
-    TILT,
-    compare_coordinates,
-    read_coordinates,
-)
+from loopcal.mechanism.platform_coordinates import EULER, POSITION, TILT, differentiate_coordinates
 from loopcal.typing import FloatArray
 
 
@@ -139,8 +133,7 @@ def choose_coordinates(T: FloatArray, twists: FloatArray) -> tuple[str, ...]:
     """
     is_steep = np.hypot(T[0, 0], T[1, 0]) < STEEP
     names = (*POSITION, *(TILT if is_steep else EULER))
-    slope = compare_coordinates(T[None], read_coordinates(T[None], names), names, 1.0)[1][0]
-    rates = slope @ twists
+    rates = differentiate_coordinates(T[None], names, 1.0)[0] @ twists
     chosen: list[int] = []
     # phi and theta are one direction, and are named together
     for group in ([0], [1], [2], *([[3, 4], [5]] if is_steep else [[3], [4], [5]])):
