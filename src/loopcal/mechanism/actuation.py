@@ -17,8 +17,7 @@ from loopcal.mechanism.limb_rows import (
     name_entries,
     name_passive_joints,
     select_block,
-    stack_closure_rows,
-    stack_displacement_columns,
+    stack_limb_rows,
 )
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.states import driven_values
@@ -156,10 +155,8 @@ def differentiate_at_pose(
     unknown[:, :, :m, p:] = np.eye(m)
     for rows, blocks in linearize_limbs(robot, values, state):
         both = stack_sum_rows(program, blocks, select_block(weights, rows)[:, 0, a:])
-        opened = np.matmul(
-            stack_displacement_columns(program, blocks),
-            select_block(displacements, rows[:1])[:, None],
-        )
+        _, E, _ = stack_limb_rows(program, blocks)
+        opened = np.matmul(E, select_block(displacements, rows[:1])[:, None])
         right = np.concatenate([np.zeros((*both.shape[:3], p)), both[..., :m]], axis=3)
         right[:, :, : opened.shape[2], :p] = opened
         right[:, :, opened.shape[2] :, :p] = -select_block(moved.parameters, rows)[:, :, a:]
@@ -221,7 +218,7 @@ def stack_sum_rows(
     program: Program, blocks: engine.ClosureBlocks, weights: FloatArray
 ) -> FloatArray:
     """Return closure rows, then sums (t, n, c + r, M + J), by freedoms and driven joints."""
-    top = stack_closure_rows(program, blocks)
+    top, *_ = stack_limb_rows(program, blocks)
     low = np.zeros((*top.shape[:2], weights.shape[1], top.shape[3]))
     low[..., len(program.unknown_twists) :] = weights[:, None]
     return np.concatenate([top, low], axis=2)
@@ -270,7 +267,7 @@ def differentiate_open_sums(
         lengths = driven_values(program, block)
         weights, moved = _differentiate_sums(robot, own, readings, lengths)
         inverse = invert_sum_rows(robot, blocks, weights[:, 0])
-        E = stack_displacement_columns(program, blocks)
+        _, E, _ = stack_limb_rows(program, blocks)
         opened = np.matmul(E, select_block(displacements, rows[:1])[:, None])
         c = opened.shape[2]
         out[rows] = np.matmul(inverse[..., c:], np.concatenate(moved, axis=3))

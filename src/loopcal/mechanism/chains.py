@@ -23,9 +23,9 @@ from loopcal.typing import FloatArray, IntArray
 
 # States of a chain: those of its stages, joined, and the frames of its platforms.
 
-# Statuses of stages, of which the last one in this order is that of the chain. Any other status,
-# such as that of another mode, is less severe than an open loop.
-SEVERITY = (CONVERGED, EXHAUSTED, STALLED, NOT_FINITE)
+# Statuses of stages in order: the last one is that of the chain. Any other status, such as that of
+# another mode, is less severe than an open loop.
+SEVERITY = {CONVERGED: 0, EXHAUSTED: 2, STALLED: 3, NOT_FINITE: 4}
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,16 +48,11 @@ def join_stage_states(robot: Mechanism, states: Sequence[State]) -> State:
     if not robot.stages:
         return states[0]
     poses = tuple(state.T for state in states)
-
-    def rank(status: NDArray[np.int8]) -> NDArray[np.int8]:
-        severity = np.ones(status.shape, np.int8)  # of another mode, among others
-        for place, known in enumerate(SEVERITY):
-            severity[status == known] = 0 if known == CONVERGED else place + 1
-        return severity
-
-    status = states[0].status
-    for state in states[1:]:
-        status = np.where(rank(state.status) > rank(status), state.status, status)
+    statuses = np.stack([state.status for state in states])
+    severity = np.ones(statuses.shape)
+    for known, rank in SEVERITY.items():
+        severity[statuses == known] = rank
+    status = np.take_along_axis(statuses, severity.argmax(axis=0)[None], axis=0)[0]
     return ChainState(
         locate_stage_bases(robot.stages, poses)[1][-1],
         tuple(joints for state in states for joints in state.joints),

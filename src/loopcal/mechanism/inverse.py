@@ -27,7 +27,7 @@ from loopcal.mechanism.chains import (
     split_stage_states,
 )
 from loopcal.mechanism.kinematics import Loops, compute_closure_sign, solve_serial
-from loopcal.mechanism.limb_rows import move_serial, place_serial
+from loopcal.mechanism.limb_rows import follow_links, place_serial
 from loopcal.mechanism.model import Mechanism, Stage
 from loopcal.mechanism.platform_coordinates import (
     compare_coordinates,
@@ -239,7 +239,10 @@ class _Rows:
             for stage, e, links, sums in zip(stages, self.e, self.links, self.sums, strict=True):
                 robot, own, weights = stage.robot, _select_drives(stage, u), None
                 if links is not None:
-                    moved.append(move_serial(robot.program.groups[0], *links, own[:, 0]))
+                    (group,) = robot.program.groups
+                    joints = own[:, 0, group.actuator[:-1, 0]]
+                    *frames, last = follow_links(group.joints, *links, joints)
+                    moved.append((last, frames))
                     continue
                 if sums is not None:
                     weights, own = sums.weights, sums.complete(u[:, None, stage.actuators])

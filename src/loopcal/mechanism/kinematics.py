@@ -15,11 +15,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from loopcal import engine, geometry
+from loopcal import engine
 from loopcal.engine import State
 from loopcal.mechanism.actuation import ITERATIONS, DrivenJoints, drive_joints, scale_sums
 from loopcal.mechanism.chains import ChainState, each_stage, join_stage_states, locate_stage_bases
-from loopcal.mechanism.limb_rows import follow_limb
+from loopcal.mechanism.limb_rows import follow_limb, follow_links, place_serial
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.sensitivity import differentiate_pose
 from loopcal.mechanism.states import Status, driven_values, list_bodies, replace_rows, without_poses
@@ -298,10 +298,11 @@ def solve_serial(
     (group,) = robot.program.groups
     t, n = max(len(e), len(driven), shape[0]), max(driven.shape[1], shape[1])
     joints = np.zeros((t, n, len(group.actuator)))
-    joints[..., : len(group.joints)] = driven[..., group.actuator[: len(group.joints), 0]]
+    joints[..., :-1] = driven[..., group.actuator[:-1, 0]]
     with np.errstate(invalid="ignore"):
-        frames, attachment = follow_limb(group, 0, e, joints)
-        T = np.broadcast_to(frames[-1] @ geometry.invert_pose(attachment), (t, n, 4, 4))
+        links, advance = place_serial(group, e)
+        frames = follow_links(group.joints, links[:, None], advance[:, None], joints)
+        T = np.broadcast_to(frames[-1], (t, n, 4, 4))
     finite = np.isfinite(joints).all(axis=2)
     zero = np.zeros((t, n))
     return State(

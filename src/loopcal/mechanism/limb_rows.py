@@ -141,37 +141,30 @@ def move_passive_joints(
     return out
 
 
-def stack_closure_rows(program: Program, blocks: engine.ClosureBlocks) -> FloatArray:
-    """Return all closure rows (t, n, c, M + J) against the freedoms of all nodes, then the driven
-    joints.
+def stack_limb_rows(
+    program: Program, blocks: engine.ClosureBlocks, *, passive: bool = False
+) -> tuple[FloatArray, FloatArray, IntArray]:
+    """Return all closure rows, or those of passive joints, limb by limb: against the freedoms of
+    all nodes, then the driven joints (t, n, c, M + J), and against displacements (t, n, c, d); and
+    the limb of each row (c,).
     """
-    M, limbs, last = len(program.unknown_twists), [*divide_limbs(program, blocks)], 0
-    count, shape = sum(own.A.shape[2] for own in limbs), limbs[0].A.shape[:2]
-    out = np.zeros((*shape, count, M + program.n_joints))
-    for own in limbs:
-        first, last = last, last + own.A.shape[2]
-        out[:, :, first:last, :M], out[:, :, first:last, M + own.drives] = own.A, own.Q
-    return out
+    M, limbs = len(program.unknown_twists), [*divide_limbs(program, blocks, passive=passive)]
+    counts = [own.A.shape[2] for own in limbs]
+    shape = *limbs[0].A.shape[:2], sum(counts)
+    rows, E = np.zeros((*shape, M + program.n_joints)), np.zeros((*shape, program.n_displacements))
+    for own, last in zip(limbs, np.cumsum(counts), strict=True):
+        part = slice(last - own.A.shape[2], last)
+        rows[:, :, part, :M], rows[:, :, part, M + own.drives] = own.A, own.Q
+        E[:, :, part, own.slots] = own.E
+    return rows, E, np.repeat([own.limb for own in limbs], counts)
 
 
 def stack_scaled_rows(robot: Mechanism, blocks: engine.ClosureBlocks) -> FloatArray:
-    """Return `stack_closure_rows`, where rotations are lengths at the robot's size."""
-    rows = stack_closure_rows(robot.program, blocks)
+    """Return the rows of `stack_limb_rows`, where rotations are lengths at the robot's size."""
+    rows, *_ = stack_limb_rows(robot.program, blocks)
     twists = [f for _, f in robot.program.unknown_twists]
     rows[..., : len(twists)] /= robot.twist_scale[twists]
     return rows
-
-
-def stack_displacement_columns(
-    program: Program, blocks: engine.ClosureBlocks, *, passive: bool = False
-) -> FloatArray:
-    """Return all closure rows, or those of passive joints, against displacements (t, n, c, d)."""
-    rows = []
-    for own in divide_limbs(program, blocks, passive=passive):
-        whole = np.zeros((*own.E.shape[:3], program.n_displacements))
-        whole[..., own.slots] = own.E
-        rows.append(whole)
-    return np.concatenate(rows, axis=2)
 
 
 def reduce_to_platform(
@@ -180,8 +173,8 @@ def reduce_to_platform(
     """Return the closure rows that contain no twist of other nodes than the platform, against its
     freedoms (t, n, c, m) and the actuated joints (t, n, c, a), by an orthogonal reduction.
     """
-    rows, m, M = (
-        stack_closure_rows(program, blocks),
+    (rows, *_), m, M = (
+        stack_limb_rows(program, blocks),
         len(program.freedoms),
         len(program.unknown_twists),
     )
@@ -205,12 +198,21 @@ def follow_limb(
     displacements : (t, s) of this limb. joints : (t, n, J + 1) its joint values.
     """
     links, pitch = place_links(group, k, displacements)
-    placed = links[:, None]
-    frames = [placed[:, :, 0]]
-    for j, letter in enumerate(group.joints):
-        motion = move_joint(letter, joints[..., j], pitch[:, None, j])
-        frames.append(frames[-1] @ motion @ placed[:, :, j + 1])
-    return frames, placed[:, :, -1]
+    frames = follow_links(group.joints, links[:, None], pitch[:, None], joints)
+    return frames, links[:, None, -1]
+
+
+def follow_links(
+    letters: str, links: FloatArray, advance: FloatArray, joints: FloatArray
+) -> list[FloatArray]:
+    """Return the frames (.., 4, 4) behind each link of (.., J + 1, 4, 4) [m], for the advances
+    (.., J) and the values (.., J) of the joints between them.
+    """
+    frames = [links[..., 0, :, :]]
+    for j, letter in enumerate(letters):
+        motion = move_joint(letter, joints[..., j], advance[..., j])
+        frames.append(frames[-1] @ motion @ links[..., j + 1, :, :])
+    return frames
 
 
 def place_serial(group: Group, displacements: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -221,22 +223,6 @@ def place_serial(group: Group, displacements: FloatArray) -> tuple[FloatArray, F
     last = links[:, -2] @ geometry.invert_pose(links[:, -1])
     slides = np.array([letter == "P" for letter in group.joints])
     return np.concatenate([links[:, :-2], last[:, None]], axis=1), np.where(slides, 1.0, pitch)
-
-
-def move_serial(
-    group: Group, links: FloatArray, advance: FloatArray, values: FloatArray
-) -> tuple[FloatArray, list[FloatArray]]:
-    """Return the platforms (R, 4, 4) [m] of a limb whose joints are all driven, in its base, and
-    the frames (R, 4, 4) of its joints, for the values (R, a) of its drives.
-
-    links, advance : (1 | R, ..) of `place_serial`.
-    """
-    frames, T = list[FloatArray](), links[:, 0]
-    for j, letter in enumerate(group.joints):
-        frames.append(T)
-        motion = move_joint(letter, values[:, group.actuator[j, 0]], advance[:, j])
-        T = T @ motion @ links[:, j + 1]
-    return T, frames
 
 
 def place_links(group: Group, k: int, displacements: FloatArray) -> tuple[FloatArray, FloatArray]:

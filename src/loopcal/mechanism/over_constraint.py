@@ -24,12 +24,7 @@ from loopcal.errors import MechanismError
 from loopcal.findings import Finding, report_finding
 from loopcal.mechanism.assembly import AXES, Assembly
 from loopcal.mechanism.kinematics import compute_readings, forward_trials
-from loopcal.mechanism.limb_rows import (
-    divide_limbs,
-    linearize_state,
-    stack_displacement_columns,
-    stack_scaled_rows,
-)
+from loopcal.mechanism.limb_rows import linearize_state, stack_limb_rows, stack_scaled_rows
 from loopcal.mechanism.mobility import RANK, check_assembly
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.states import Status, join_states, select_poses
@@ -91,11 +86,8 @@ def _linearize(robot: Mechanism, state: State) -> list[_Rows]:
     """Return the equations at the poses of a state (1, n), at the nominal values."""
     program, blocks = robot.program, linearize_state(robot, state, robot.parameters.nominal[None])
     both, M = stack_scaled_rows(robot, blocks)[0], len(program.unknown_twists)
-    E, absorbed = (
-        stack_displacement_columns(program, blocks, passive=passive)[0] for passive in (False, True)
-    )
-    counts = [(own.limb, own.A.shape[2]) for own in divide_limbs(program, blocks)]
-    limb = np.repeat(*np.transpose(counts))
+    _, (E,), limb = stack_limb_rows(program, blocks)
+    _, (absorbed,), _ = stack_limb_rows(program, blocks, passive=True)
     return [_Rows(own[:, :M], own, E[i], limb, absorbed[i]) for i, own in enumerate(both)]
 
 

@@ -226,7 +226,7 @@ def differentiate_bodies(
 
 def differentiate_sensed_values(
     robot: Mechanism, values: FloatArray, q: FloatArray, state: State, names: Sequence[str]
-) -> PassiveSensitivity:
+) -> Derivatives:
     """Differentiate passive joints and the numbers of bodies, by name."""
     known: list[str] = []
     derivatives: list[tuple[FloatArray, FloatArray]] = []
@@ -242,7 +242,5 @@ def differentiate_sensed_values(
         known += joints.names
         derivatives.append((joints.parameters, joints.readings))
     places = [known.index(name) for name in names]
-    selected = (
-        np.concatenate(arrays, axis=2)[:, :, places] for arrays in zip(*derivatives, strict=True)
-    )
-    return PassiveSensitivity(tuple(names), *selected)
+    arrays = zip(*derivatives, strict=True)
+    return Derivatives(*(np.concatenate(of, axis=2)[:, :, places] for of in arrays))

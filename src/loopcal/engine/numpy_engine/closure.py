@@ -223,22 +223,21 @@ class Chain:
         rows = stack((*(self.size * axis), *cross(axis, arm)))
         return rows[list(self.group.rows)]
 
+    def rows_of_axis(self, f: int, arm: FloatArray) -> FloatArray:
+        """Return the rows of a turn about (f = 0..2) or a shift along (3..5) a base axis."""
+        axis = np.eye(3)[f % 3, :, None, None]
+        return self.rows_of_turn(axis, arm) if f < 3 else self.rows_of_shift(axis)
+
     def rows_of_freedom(self, f: int) -> FloatArray:
-        """Return the rows of a freedom: turn about (f = 0..2) or shift along (3..5) a base axis."""
+        """Return the rows of a freedom of the body at which the limbs end."""
         if self.group.ending == "distance":
             return (self.moment if f < 3 else self.direction)[f % 3][None]
-        axis = np.zeros((3, 1, 1))
-        axis[f % 3] = 1.0
-        return self.rows_of_turn(axis, self.arm) if f < 3 else self.rows_of_shift(axis)
+        return self.rows_of_axis(f, self.arm)
 
     def rows_of_carrier(self, f: int) -> FloatArray:
         """Return the rows of a freedom of the body on which the limbs begin; it moves the tip."""
         assert self.carrier is not None
-        axis = np.zeros((3, 1, 1))
-        axis[f % 3] = 1.0
-        if f >= 3:
-            return -self.rows_of_shift(axis)
-        return -self.rows_of_turn(axis, self.tip - self.carrier[:, 3])
+        return -self.rows_of_axis(f, self.tip - self.carrier[:, 3])
 
     def list_slopes(self, program: Program) -> list[FloatArray]:
         """Return the rows of the freedoms of the bodies at which the limbs begin, then end."""

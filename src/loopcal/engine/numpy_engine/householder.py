@@ -59,20 +59,10 @@ def fold(factor: FloatArray, rows: FloatArray) -> FloatArray:
     The stack is triangularized by QR, many rows in parts that fit the cache.
     """
     t, p = factor.shape[:2]
-    rows, is_begun = np.broadcast_to(rows, (t, *rows.shape[1:])), factor.any(axis=(1, 2))
-    if is_begun.any() and not is_begun.all():
-        out = np.empty_like(factor)
-        for part in (is_begun, ~is_begun):  # a factor of zeros would change the bits
-            out[part] = fold(factor[part], rows[part])
-        return out
-    stack = [factor, rows] if is_begun.any() else [rows]
-    height = PART * p
-    count = rows.shape[1] // height
+    rows, height = np.broadcast_to(rows, (t, *rows.shape[1:])), PART * p
+    count, stack = rows.shape[1] // height, [factor, rows]
     if count > 1:
-        divided = stack[-1][:, : count * height].reshape(t, count, height, p)
+        divided = rows[:, : count * height].reshape(t, count, height, p)
         factors = np.asarray(np.linalg.qr(divided, mode="r"))
-        stack[-1:] = factors.reshape(t, count * p, p), stack[-1][:, count * height :]
-    whole = stack[0] if len(stack) == 1 else np.concatenate(stack, axis=1)
-    R = np.asarray(np.linalg.qr(whole, mode="r"))
-    missing = p - R.shape[1]
-    return np.concatenate([R, np.zeros((t, missing, p))], axis=1) if missing else R
+        stack = [factor, factors.reshape(t, count * p, p), rows[:, count * height :]]
+    return np.asarray(np.linalg.qr(np.concatenate(stack, axis=1), mode="r"))

@@ -37,6 +37,7 @@ from loopcal.mechanism.families.placement import (
     translate,
 )
 from loopcal.mechanism.families.records import RobotRecord, check_spherical, values_per_leg
+from loopcal.mechanism.joint_graph.graph import find_perpendicular
 from loopcal.typing import FloatArray
 from loopcal.units import Angle, Dimension, Length, Ratio
 
@@ -80,7 +81,7 @@ def build_leg(
         gap, f"{name} has length zero at home. Move its centers or the home pose"
     )
     pitch = turned = 0.0
-    lower = upper = _across(s, EZ)
+    lower = upper = find_perpendicular(s, EZ)
     if screw:
         zero = f"a joint axis of {name} is [0, 0, 0]. Give a direction"
         (lower, _), (upper, _) = (_normalize(axis, zero) for axis in screw[1:])
@@ -90,7 +91,7 @@ def build_leg(
                 f"a screw's joint axis lies along {name} at home. Give it another direction"
             )
         pitch = screw[0] / (2 * np.pi)
-    low, high = _across(s, lower), _across(s, upper)
+    low, high = (find_perpendicular(s, axis) for axis in (lower, upper))
     if screw:
         turned = float(np.arctan2(np.cross(low, high) @ s, low @ high))
     # the axes in the base frame, which is the carried frame while every joint is at zero
@@ -111,14 +112,6 @@ def build_leg(
     )
     end = rotation_matrix(home[:3, :3]), "rigid", translate(*top)
     return place_limb(name, (*steps, *thread), *end)
-
-
-def _across(s: FloatArray, axis: FloatArray) -> FloatArray:
-    """Return the unit vector across s nearest to `axis`, or any if they are parallel."""
-    part = axis - float(axis @ s) * s
-    if np.linalg.norm(part) < 1e-6 * np.linalg.norm(axis):
-        part = np.cross(s, np.eye(3)[int(np.argmin(np.abs(s)))])
-    return np.array(part / np.linalg.norm(part), dtype=float)
 
 
 def _normalize(vector: ArrayLike, refusal: str) -> tuple[FloatArray, float]:
