@@ -109,16 +109,28 @@ def test_solution_after_elimination_equals_the_joint_solution():
     assert linearized.equations[0] == len(stacked) - len(local)
 
 
-def test_standard_deviations_equal_those_of_the_joint_problem():
+@pytest.mark.parametrize("stated", [1.0, 5.0])
+def test_standard_deviations_equal_those_of_the_joint_problem(stated):
+    """Residuals below the stated noise say nothing about priors of the setup."""
     data = simulate_mixed_data()
-    fit = identify(hexapod(), data, LeastSquares(), options=FitOptions(sigma_uncertainty=0.0))
+    rows = tuple(replace(o, covariance=stated**2 * o.covariance) for o in data.observations)
+    data = replace(data, observations=rows)
+    local = collect_nuisance_parameters(data.observations, data.labels)
+    known = local.with_nominal(local.values(true_setup_values(TRACKER))).with_prior("frame.*", UM)
+    options = {1.0: FitOptions(sigma_uncertainty=0.0, nuisance=local),
+               5.0: FitOptions(noise="estimated", nuisance=known)}[stated]  # fmt: skip
+    fit = identify(hexapod(), data, LeastSquares(), options=options)
     free = select_free_parameters(fit.robot)
     at = observe_poses(free, data.readings)
-    rows = observe_rows(
-        at, data, collect_nuisance_parameters(data.observations, data.labels), fit.nuisance.estimate
-    )[0, :, :-1]
+    rows = observe_rows(at, data, local, fit.nuisance.estimate)[0, :, :-1]
     scale = np.linalg.norm(rows, axis=0)
-    sd = np.sqrt(np.diag(np.linalg.inv((rows / scale).T @ (rows / scale)))) / scale
+    by_rows, by_prior = (rows / scale).T @ (rows / scale), np.zeros(len(scale))
+    tolerance = options.nuisance.table.tolerance
+    by_prior[: len(local)] = np.where(np.isnan(tolerance), 0.0, tolerance**-2.0)
+    by_prior = np.diag(by_prior / scale**2)
+    inverse = np.linalg.inv(by_rows + by_prior)
+    noise = fit.residual_test.sigma_scale ** 2
+    sd = np.sqrt(np.diag(inverse @ (noise * by_rows + by_prior) @ inverse)) / scale
     assert_allclose(fit.nuisance.sd, sd[: len(fit.nuisance)], rtol=1e-3)
     assert_allclose(fit.standard_deviations, sd[len(fit.nuisance) :] * free.tolerance, rtol=1e-3)
 

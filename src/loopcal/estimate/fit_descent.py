@@ -492,9 +492,12 @@ def add_setup_uncertainty(result: Identification, fit: Descent) -> Identificatio
     rows = (setup.slope[stated] / setup.table.tolerance[stated, None]) @ V
     used = fit.decomposition.used[0]
     change = np.divide(rows, information + fit.penalty[0], out=np.zeros_like(rows), where=used)
-    root = np.sqrt(1.0 - test.sigma_scale**2) * (V @ change.T)
+    own = setup.root.fill(np.arange(len(setup.table))) / test.sigma_scale
+    by_prior = own @ own[stated].T / setup.table.tolerance[stated]
+    root = np.vstack([result.tolerance[:, None] * (V @ change.T), by_prior])
     finding = report_finding("noise.setup-as-stated", scale=test.sigma_scale)
-    return add_covariance(result, result.tolerance[:, None] * root, np.inf, finding)
+    root *= np.sqrt(1.0 - test.sigma_scale**2)
+    return add_covariance(result, root, np.inf, finding)
 
 
 def compute_loss_variance(
