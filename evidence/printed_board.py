@@ -32,6 +32,16 @@ SIGMA = 0.1
 
 CORNERS = (8, 6)
 NORMAL_95 = 1.959963984540054
+COLUMNS = [
+    "machine",
+    "machines",
+    "parameters in their 95 % intervals [%]",
+    "lens in its 95 % intervals [%]",
+    "error of the tool (rms) [um]",
+    "stated over true",
+    "chi-square / degrees",
+]
+FORMATS = ["", "d", ".1f", ".1f", ".2f", ".2f", ".3f"]
 TRUE_LENS = np.array([3260.0, 3268.0, 2021.0, 1487.0, 0.09, -0.16, 0.05, 0.0008, -0.0006])
 
 
@@ -191,6 +201,49 @@ def photograph(points: Array, lens: Array) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
+class Scene:
+    """One machine with a camera and a board: what is true, and where a person would put them."""
+
+    truth: Values
+    q: Array  # (n, a) readings
+    x: Array  # (n, c) true coordinates there
+    stated: tuple[Array, Array]  # camera in the base, board on the platform
+    true: tuple[Array, Array]
+    lens: Array
+
+    def locate_board(self, machine: Machine, x: Array) -> Array:
+        """Return T_camera_board (4, 4) at the coordinates of a pose."""
+        return np.linalg.inv(self.true[0]) @ place(machine, x) @ self.true[1]
+
+
+def build_scene(machine: Machine, rng: np.random.Generator, poses: int) -> Scene:
+    """Return a machine whose errors are drawn from its tolerances, at drawn poses."""
+    table = load_robot(machine.robot).parameters
+    nominal = dict(zip(table.names, table.nominal.tolist(), strict=True))
+    truth = {
+        e.name: e.nominal + (e.tolerance or 0.0) * rng.standard_normal() * e.free
+        for e in table.entries
+    }
+    commanded = rng.uniform(machine.low, machine.high, (poses, len(machine.low)))
+    q = np.array([machine.drive(nominal, x) for x in commanded])
+    x = np.array([locate(machine, truth, *each) for each in zip(q, commanded, strict=True)])
+    middle = place(machine, 0.5 * (np.array(machine.low) + machine.high))[:3, 3]
+    square, (columns, rows) = machine.square, CORNERS
+    board = make_pose(
+        np.diag([1.0, -1.0, -1.0]), square * np.array([-0.5 * (columns - 1), 0.5 * (rows - 1), 0.0])
+    )
+    camera = look_at(middle + machine.camera, middle)
+    # the board is mounted, and the camera set up, by hand
+    twist = rng.standard_normal((2, 6)) * np.repeat([0.03, 0.004], 3)
+    true_camera, true_board = (
+        make_pose(exp_so3(t[:3]) @ T[:3, :3], T[:3, 3] + t[3:])
+        for t, T in zip(twist, (camera, board), strict=True)
+    )
+    lens = TRUE_LENS * (1.0 + 0.01 * rng.standard_normal(9))
+    return Scene(truth, q, x, (camera, board), (true_camera, true_board), lens)
+
+
+@dataclass(frozen=True, eq=False)
 class Sample:
     """One machine: its measurements and what is true."""
 
@@ -204,40 +257,20 @@ class Sample:
 def simulate_machine(machine: Machine, seed: int, poses: int = POSES) -> Sample:
     """Return the pictures of a machine whose errors are drawn from its tolerances."""
     rng, robot = np.random.default_rng([SEED, seed]), load_robot(machine.robot)
-    table = robot.parameters
-    nominal = dict(zip(table.names, table.nominal.tolist(), strict=True))
-    truth = {
-        e.name: e.nominal + (e.tolerance or 0.0) * rng.standard_normal() * e.free
-        for e in table.entries
-    }
-    commanded = rng.uniform(machine.low, machine.high, (poses + PREDICTED, len(machine.low)))
-    q = np.array([machine.drive(nominal, x) for x in commanded])
-    x = np.array([locate(machine, truth, *each) for each in zip(q, commanded, strict=True)])
-    middle = place(machine, 0.5 * (np.array(machine.low) + machine.high))[:3, 3]
+    scene = build_scene(machine, rng, poses + PREDICTED)
     square, (columns, rows) = machine.square, CORNERS
-    stated = make_pose(
-        np.diag([1.0, -1.0, -1.0]), square * np.array([-0.5 * (columns - 1), 0.5 * (rows - 1), 0.0])
-    )
-    camera = look_at(middle + machine.camera, middle)
-    # the board is mounted, and the camera set up, by hand
-    twist = rng.standard_normal((2, 6)) * np.repeat([0.03, 0.004], 3)
-    true_camera, true_board = (
-        make_pose(exp_so3(t[:3]) @ T[:3, :3], T[:3, 3] + t[3:])
-        for t, T in zip(twist, (camera, stated), strict=True)
-    )
-    lens = TRUE_LENS * (1.0 + 0.01 * rng.standard_normal(9))
     flat = [
         [square * (i % columns), square * (i // columns), 0.0, 1.0] for i in range(columns * rows)
     ]
     pixels = []
-    for each in x[:poses]:
-        body = np.linalg.inv(true_camera) @ place(machine, each) @ true_board
-        pixels.append(photograph((np.array(flat) @ body.T)[:, :3], lens))
+    for each in scene.x[:poses]:
+        body = scene.locate_board(machine, each)
+        pixels.append(photograph((np.array(flat) @ body.T)[:, :3], scene.lens))
     seen = np.array(pixels) + SIGMA * rng.standard_normal((poses, len(flat), 2))
     inside = ((seen > 0) & (seen < [4000, 3000])).all(axis=-1)
     kind = Image(
-        T_camera=camera,
-        T_board=stated,
+        T_camera=scene.stated[0],
+        T_board=scene.stated[1],
         focal=(3150.0, 3150.0),
         corners=CORNERS,
         square=square,
@@ -247,12 +280,14 @@ def simulate_machine(machine: Machine, seed: int, poses: int = POSES) -> Sample:
     columns_seen = np.column_stack([corner[inside], seen[inside]])
     rows_of = np.repeat(np.arange(poses), inside.sum(axis=1))
     observed = Observations.from_sigma(kind, rows_of, columns_seen, SIGMA)
-    data = Measurements(robot.name, q[:poses], (observed,))
-    setup = {
-        f"camera.{n}": v
-        for n, v in zip(("fx", "fy", "cx", "cy", "k1", "k2", "k3", "p1", "p2"), lens, strict=True)
-    }
-    return Sample(data, truth, q[poses:], x[poses:], setup)
+    data = Measurements(robot.name, scene.q[:poses], (observed,))
+    return Sample(data, scene.truth, scene.q[poses:], scene.x[poses:], name_lens(scene.lens))
+
+
+def name_lens(lens: Array) -> Values:
+    """Return the parameters of a lens (9,) by their names in loopcal."""
+    names = ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "p1", "p2")
+    return {f"camera.{n}": v for n, v in zip(names, lens, strict=True)}
 
 
 def predict_errors(machine: Machine, sample: Sample, values: Values) -> Array:
@@ -292,7 +327,11 @@ class Outcome:
 def examine_machine(name: str, seed: int) -> Outcome:
     """Return whether the truth is in the intervals, and the accuracy of the position."""
     machine = MACHINES_BY_NAME[name]
-    sample = simulate_machine(machine, seed)
+    return judge(machine, simulate_machine(machine, seed))
+
+
+def judge(machine: Machine, sample: Sample) -> Outcome:
+    """Return what the calibration of a machine states, and what is true."""
     robot = load_robot(machine.robot)
     fit = lc.identify(robot, sample.data)
     assert fit.converged
@@ -353,19 +392,9 @@ def collect() -> dict[str, Any]:
         summarize(name, [examine_machine(name, seed) for seed in range(machine.times * MACHINES)])
         for name, machine in MACHINES_BY_NAME.items()
     ]
-    columns = [
-        "machine",
-        "machines",
-        "parameters in their 95 % intervals [%]",
-        "lens in its 95 % intervals [%]",
-        "error of the tool (rms) [um]",
-        "stated over true",
-        "chi-square / degrees",
-    ]
-    formats = ["", "d", ".1f", ".1f", ".2f", ".2f", ".3f"]
     return {
         "seeds": [SEED, SEED],
-        "tables": {"coverage": {"columns": columns, "formats": formats, "rows": rows}},
+        "tables": {"coverage": {"columns": COLUMNS, "formats": FORMATS, "rows": rows}},
     }
 
 

@@ -22,21 +22,41 @@ def render(
     blur: float = 0.7,
     noise: float = 2.0,
     seed: int = 1,
+    scale: tuple[float, float] = (1.0, 1.0),
+    fine: int = 3,
 ) -> np.ndarray:
     """Return a picture (height, width) of a board in front of a gray wall, by rays of our own.
 
     lens : fx, fy, cx, cy, k1, k2, k3, p1, p2. blur : of a Gaussian [px]. noise : of gray values.
-    A pixel is the mean of 3 x 3 rays. The edges of the picture are darker (vignetting).
+    scale : of the print along x and y. A pixel is the mean of `fine` x `fine` rays, computed where
+    the board may be. The edges of the picture are darker (vignetting).
     """
-    # rays a pixel side, pixels from ray to ray whose place is computed (linear between them, to a
-    # thousandth of a pixel), texture pixels per meter
-    fine, step, scale = 3, 4, 8000.0
-    width, height = (round(n * board.square * scale) for n in board.squares)
+    # pixels from ray to ray whose place is computed (linear between them, to a thousandth of a
+    # pixel), texture pixels per meter
+    step, dense = 4, 8000.0
+    width, height = (round(n * board.square * dense) for n in board.squares)
     texture = 30.0 + 0.75 * make_charuco(board).generateImage((width, height)).astype(np.float32)
-    margin = round(board.square * scale)  # white paper around the squares
+    margin = round(board.square * dense)  # white paper around the squares
     texture = np.pad(texture, margin, constant_values=texture.max())
+    if fine == 1:  # rays are as far apart as pixels: no details are finer
+        pixel = dense * T_camera_board[2, 3] / lens[0]
+        texture = cv2.GaussianBlur(texture, (0, 0), 0.5 * pixel)
     fx, fy, cx, cy, k1, k2, k3, p1, p2 = lens
-    u, v = ((np.arange(-1, -(-n // step) + 1) + 0.5) * step - 0.5 for n in size)
+    # where a circle about the paper is, in whole steps
+    middle = 0.5 * board.square * np.array([*(n - 2 for n in board.squares), 0.0])
+    center = T_camera_board[:3, :3] @ middle + T_camera_board[:3, 3]
+    slope, reach = center[:2] / center[2], 0.7 * board.square * np.hypot(*board.squares)
+    reach = (1.0 + np.hypot(*slope)) * reach / (center[2] - reach) if center[2] > reach else np.inf
+    reach = 1.2 * reach + 10.0 / fx
+    low, high = (
+        np.clip(lens[:2] * (slope + side) + lens[2:4], 0, size) for side in (-reach, reach)
+    )
+    first = step * np.floor(low / step).astype(int)
+    part = np.minimum(step * np.ceil(high / step).astype(int), size) - first
+    u, v = (
+        np.arange(b - 0.5 * step - 0.5, b + n + 1.5 * step, step)
+        for b, n in zip(first, part, strict=True)
+    )
     x, y = np.meshgrid((u - cx) / fx, (v - cy) / fy)
     seen_x, seen_y = x, y
     for _ in range(6):  # the distortion is inverted by a fixed-point iteration
@@ -50,29 +70,38 @@ def render(
     depth = (R[:, 2] @ t) / (rays @ R[:, 2])
     p = (rays * depth[..., None] - t) @ R  # on the board, from corner 0
     # linear between the middles of texels, or edges along rows of rays jump by a ray
-    place = (p[..., :2] + board.square) * scale + margin - 0.5
+    place = (p[..., :2] / scale + board.square) * dense + margin - 0.5
     times = step * fine
     every = cv2.resize(place.astype(np.float32), None, fx=times, fy=times)
-    every = every[times : times + fine * size[1], times : times + fine * size[0]]
+    every = every[times:, times:][: fine * part[1], : fine * part[0]]
     across, down = cv2.split(every)
     values = cv2.remap(
         texture, across, down, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=110
     )
     if blur > 0.0:
         values = cv2.GaussianBlur(values, (0, 0), blur * fine)
-    picture = cv2.resize(values, size, interpolation=cv2.INTER_AREA)
-    r = np.hypot(*np.meshgrid(np.linspace(-1, 1, size[0]), np.linspace(-1, 1, size[1])))
-    picture = picture * (1.0 - 0.15 * r * r)
-    picture = picture + noise * np.random.default_rng(seed).normal(size=picture.shape)
-    return np.clip(np.round(picture), 0, 255).astype(np.uint8)
+    picture = np.full(size[::-1], 110.0, np.float32)
+    picture[first[1] :, first[0] :][: part[1], : part[0]] = cv2.resize(
+        values, part.tolist(), interpolation=cv2.INTER_AREA
+    )
+    across, down = (np.linspace(-1, 1, n, dtype=np.float32) for n in size)
+    picture *= 1.0 - 0.15 * (across**2 + down[:, None] ** 2)
+    random = np.random.default_rng(seed).standard_normal(picture.shape, np.float32)
+    return np.clip(np.round(picture + noise * random), 0, 255).astype(np.uint8)
 
 
-def project_corners(board: Board, T_camera_board: np.ndarray, lens: np.ndarray) -> np.ndarray:
+def project_corners(
+    board: Board,
+    T_camera_board: np.ndarray,
+    lens: np.ndarray,
+    scale: tuple[float, float] = (1.0, 1.0),
+) -> np.ndarray:
     """Return the true pixels (corners, 2), by the formulas of OpenCV's documentation."""
     fx, fy, cx, cy, k1, k2, k3, p1, p2 = lens
     columns, rows = board.corners
     number = np.arange(columns * rows)
     place = np.stack([number % columns, number // columns, 0 * number], axis=1) * board.square
+    place = place * [*scale, 0.0]
     c = place @ T_camera_board[:3, :3].T + T_camera_board[:3, 3]
     x, y = c[:, 0] / c[:, 2], c[:, 1] / c[:, 2]
     r = x * x + y * y
