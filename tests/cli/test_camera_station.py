@@ -58,33 +58,40 @@ def test_prior_of_a_session_is_left_out_and_one_of_nothing_is_refused(loopcal, t
 
 
 @pytest.mark.slow
-def test_planned_station_leads_by_rendered_pictures_to_the_true_machine(loopcal, tmp_path):
+@pytest.mark.parametrize("stations", [1, 2])
+def test_planned_stations_lead_by_rendered_pictures_to_the_true_machine(loopcal, stations):
     """Board, plan, pictures of a machine with errors, corners, calibration: as a user does it."""
     loopcal("board -o board.yaml --columns 5 --rows 4 --square 30mm")
     board = Path("board.yaml").read_text("utf-8").replace("# measured", "measured")
     Path("board.yaml").write_text(board)
     words = "plan hexapod-42 -o plan --measure camera --board board.yaml --poses 10 --hold-out 5"
-    words += " --candidates 60 --seen-from 0.15m,0.15m,0.75m"
+    words += f" --candidates 60 --seen-from 0.15m,0.15m,0.75m --stations {stations}"
     loopcal(words, "Put the camera at x 150 mm", "loopcal photos PICTURES")
+    assert Path("plan/plan.csv").read_text("utf-8").count(": Put the camera at") == stations
     robot = lc.load_robot("hexapod-42")
     truth = robot.with_values(sample_truth(robot, 1, 8)[0])
-    kind = load_instrument("plan/measurements.csv", robot).sensors[0].kind
-    assert isinstance(kind, ImageKind)
+    planned = [sensor.kind for sensor in load_instrument("plan/measurements.csv", robot).sensors]
+    kinds = {kind.camera: kind for kind in planned if isinstance(kind, ImageKind)}
+    assert len(kinds) == len(planned) == stations
     size, shown = (640, 480), read_board("board.yaml")
     lens = np.array([640.0, 641.5, 322.0, 237.0, 0.04, -0.08, 0.0, 0.0, 0.0])
     Path("pictures").mkdir()
     rows = Path("plan/plan.csv").read_text("utf-8").splitlines()
     names = [line.split(",") for line in rows if not line.startswith("##")]
     place, first = names[0].index("pose"), names[0].index("q1 [mm]")
+    camera, used = names[0].index("camera") if stations > 1 else None, set()
     turned = make_pose(exp_so3(np.array([0.02, -0.01, 0.03])), np.array([0.004, -0.006, 0.01]))
-    for i, row in enumerate(row for row in names[1:] if row[place]):
+    for i, row in enumerate(row for row in names[1:] if row[place] != "home"):
         T = lc.forward(truth, 1e-3 * np.array([row[first : first + 6]], dtype=float)).T[0]
+        kind = kinds["camera" if camera is None else row[camera]]
+        used.add(kind.camera)
         seen = np.linalg.inv(kind.T_camera @ turned) @ T @ kind.T_board
         Image.fromarray(render(shown, seen, lens, size, seed=i)).save(f"pictures/{row[place]}.png")
+    assert used == kinds.keys()
     loopcal("photos pictures --board board.yaml --poses plan/poses.csv -o plan/points.csv")
     loopcal("calibrate hexapod-42 plan/points.csv -o run", code=(0, 2))
     fit = lc.load_run("run").result["fit"]
     assert fit["chi_square"] / fit["degrees"] < 0.15  # of the assumed 0.1 px: below 0.04 px
     assert set(lc.load_measurements("plan/points.csv", robot).labels) == {
-        r[place] for r in names[1:]
+        r[place] for r in names[1:] if r[place] != "home"
     }

@@ -140,3 +140,42 @@ def test_measured_lengths_correct_a_board_printed_at_97_percent(
     plain, shrunk = (lc.load_run(name) for name in ("plain", "shrunk"))
     assert np.abs(shrunk.robot.values - plain.robot.values).max() < 2e-6  # [m, rad]
     assert "board.scale_x: {start: -30000 ppm," in Path("shrunk.csv").read_text("utf-8")
+
+
+@pytest.mark.slow
+def test_column_picture_of_the_poses_names_files_and_stays_in_the_table(
+    photographed, loopcal, monkeypatch
+) -> None:
+    monkeypatch.chdir(photographed)
+    head, *rows = Path("poses.csv").read_text("utf-8").splitlines()
+    lines = [f"picture,{head}", *(f"p{i}.png,pose{row[1:]}" for i, row in enumerate(rows))]
+    Path("named.csv").write_text("\n".join(lines) + "\n")
+    loopcal("photos pictures --board board.yaml --poses named.csv -o named-points.csv")
+    data = lc.load_measurements("named-points.csv", lc.load_robot("hexapod-42"))
+    assert set(data.labels) == {f"pose{i}" for i in range(9)}
+
+
+@pytest.mark.slow
+def test_board_caliper_and_readings_in_inches_make_the_same_machine(
+    photographed, loopcal, monkeypatch
+) -> None:
+    monkeypatch.chdir(photographed)
+    text = Path("board.yaml").read_text("utf-8")
+    inches = re.sub(r"([\d.]+) mm", lambda m: f"{float(m[1]) / 25.4!r} in", text)
+    Path("inches.yaml").write_text(inches)
+    head, *rows = Path("poses.csv").read_text("utf-8").splitlines()
+    cells = [row.split(",") for row in rows]
+    lines = [",".join([name, *(f"{float(x) / 25.4!r}" for x in q)]) for name, *q in cells]
+    Path("inch.csv").write_text("\n".join([head.replace("[mm]", "[in]"), *lines]) + "\n")
+    for name, table in (("board", "poses"), ("inches", "inch")):
+        words = f"photos pictures --board {name}.yaml --poses {table}.csv -o {name}-points.csv"
+        loopcal(words)
+        loopcal(f"calibrate hexapod-42 {name}-points.csv -o of-{name}", code=(0, 2))
+    millimeters, inches = (lc.load_run(f"of-{name}").robot.values for name in ("board", "inches"))
+    np.testing.assert_allclose(inches, millimeters, rtol=0, atol=1e-8)  # [m, rad]
+    loopcal("board -o half.yaml --columns 6 --rows 5 --square 0.5in", "Measure 76.2 mm")
+    half = Path("half.yaml").read_text("utf-8").replace("# measured", "measured")
+    half = re.sub("76.20 mm, 63.50 mm", "2.997 in, 2.503 in", half)
+    Path("half.yaml").write_text(re.sub("0.05 mm", "0.002 in", half))
+    (x, sd), (y, _) = read_board("half.yaml").scales
+    assert (x, y, sd) == pytest.approx((-0.001, 0.0012, 0.002 / 3.0), abs=1e-9)

@@ -129,7 +129,7 @@ def test_standard_deviations_equal_those_of_the_joint_problem(stated):
     by_prior[: len(local)] = np.where(np.isnan(tolerance), 0.0, tolerance**-2.0)
     by_prior = np.diag(by_prior / scale**2)
     inverse = np.linalg.inv(by_rows + by_prior)
-    noise = fit.residual_test.sigma_scale ** 2
+    noise = fit.residual_test.sigma_scale**2
     sd = np.sqrt(np.diag(inverse @ (noise * by_rows + by_prior) @ inverse)) / scale
     assert_allclose(fit.nuisance.sd, sd[: len(fit.nuisance)], rtol=1e-3)
     assert_allclose(fit.standard_deviations, sd[len(fit.nuisance) :] * free.tolerance, rtol=1e-3)

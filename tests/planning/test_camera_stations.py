@@ -12,7 +12,7 @@ from loopcal.geometry import exp_so3, make_pose, pose_difference
 from loopcal.measure.instrument import Instrument
 from loopcal.measure.kinds.image import Image
 from loopcal.measure.simulation import sample_truth
-from loopcal.planning.camera_stations import choose_station, list_stations
+from loopcal.planning.camera_stations import choose_stations, list_stations
 
 CALIPER = ((0.0, 3.6e-4),) * 2
 OPTIONS = lc.PlanOptions(n_poses=20, n_candidates=100)
@@ -51,7 +51,7 @@ def find_errors(robot: lc.Mechanism, instrument: Instrument, poses: np.ndarray) 
 def test_machines_end_with_the_promised_error(name):
     robot = lc.load_robot(name)
     camera = Image(corners=(4, 3), square=robot.size / 10.0)
-    instrument, found = choose_station(robot, camera, OPTIONS, CALIPER)
+    instrument, (found,) = choose_stations(robot, camera, OPTIONS, CALIPER)
     made = lc.plan(robot, instrument, options=OPTIONS)
     errors = find_errors(robot, instrument, made.poses.coordinates[~made.poses.held_out])
     rms = float(np.sqrt((errors**2).mean()))
@@ -63,7 +63,7 @@ def test_machines_end_with_the_promised_error(name):
 def test_delta_from_straight_above_would_end_with_a_larger_error():
     """A board that keeps its orientation shows the focal length only at an angle."""
     robot = lc.load_robot("linear-delta")
-    instrument, _ = choose_station(robot, Image(square=0.01), OPTIONS, CALIPER)
+    instrument, _ = choose_stations(robot, Image(square=0.01), OPTIONS, CALIPER)
     (sensor,), poses = instrument.sensors, lc.sample_workspace(robot, 30, 1).solution
     steep = next(
         iter(list_stations(robot, get_camera(instrument), poses))
@@ -89,7 +89,7 @@ def test_either_side_of_the_platform_may_carry_the_board(side):
     place = np.array([0.1, 0.0, 0.2 + side * 0.4])
     sight = lc.LineOfSight(place, np.array([0.0, 0.0, 1.0]), cone=np.pi)
     options = replace(OPTIONS, constraints=lc.Constraints(sight=sight))
-    instrument, found = choose_station(robot, Image(square=0.01), options, CALIPER)
+    instrument, (found,) = choose_stations(robot, Image(square=0.01), options, CALIPER)
     assert found.data["side"] == ("z" if side > 0.0 else "-z")
     assert found.data["seen"] > 95.0
     assert get_camera(instrument).T_board[2, 2] == -side
@@ -102,14 +102,14 @@ def test_place_without_usable_pictures_promises_nothing(place, square):
     sight = lc.LineOfSight(np.array(place), np.array([0.0, 0.0, 1.0]), cone=np.pi)
     options = replace(OPTIONS, constraints=lc.Constraints(sight=sight))
     with pytest.raises(lc.DataError, match="pictures from there cannot be used"):
-        choose_station(lc.load_robot("hexapod-42"), Image(square=square), options, CALIPER)
+        choose_stations(lc.load_robot("hexapod-42"), Image(square=square), options, CALIPER)
 
 
 def test_line_of_sight_fixes_the_station():
     robot = lc.load_robot("linear-delta")
     sight = lc.LineOfSight(np.array([0.5, 0.1, 0.6]), np.array([0.0, 0.0, 1.0]))
     options = replace(OPTIONS, constraints=lc.Constraints(sight=sight))
-    instrument, _ = choose_station(robot, Image(square=0.01), options, CALIPER)
+    instrument, _ = choose_stations(robot, Image(square=0.01), options, CALIPER)
     assert get_camera(instrument).T_camera[:3, 3].tolist() == [0.5, 0.1, 0.6]
     with pytest.raises(lc.DataError, match="fixed camera only"):
-        choose_station(robot, Image(mount="camera"), OPTIONS)
+        choose_stations(robot, Image(mount="camera"), OPTIONS)

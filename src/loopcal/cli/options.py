@@ -694,6 +694,11 @@ UNKNOWN: Any = Group(
     board=path(
         "With --measure camera: file of the board, by loopcal board. Default: 10 x 7 squares."
     ),
+    stations=option(
+        "With --measure camera: stations of the camera, from each of which it sees some poses.  "
+        "[default: 1]",
+        type=Count("STATIONS", 1),
+    ),
     unknown_frames=option(
         "Unknown frames: base (the frame of the instrument in the base), tool, or base,tool.",
         "--frames",
@@ -747,14 +752,15 @@ def make_instrument(
     from loopcal.apply import simulated_measurements
 
     described = {key: value for key, value in stated.items() if value is not None}
-    board = described.pop("board", None)
+    board, stations = (described.pop(name, None) for name in ("board", "stations"))
     if described.get("measure") == (CAMERA,) and robot is not None:
         others = (*INSTRUMENT.members, "unknown_frames", "targets")
         sentence = "{reason} takes no {option}. Leave it out, or describe the camera with --like"
         refuse_given(others, "--measure camera", sentence)
-        return _place_camera(robot, board, lc.PlanOptions(**placed))
-    if board is not None:
-        raise DataError("--board belongs to --measure camera. Add it, or leave --board out")
+        return _place_camera(robot, board, lc.PlanOptions(**placed), stations or 1)
+    for name, value in (("--board", board), ("--stations", stations)):
+        if value is not None:
+            raise DataError(f"{name} belongs to --measure camera. Add it, or leave {name} out")
     if (components := described.pop("measure", None)) is not None:
         if "components" in described or described["kinds"] != ("pose",):
             raise DataError(
@@ -770,11 +776,13 @@ def make_instrument(
     return instrument if robot is None else simulated_measurements.place_targets(instrument, robot)
 
 
-def _place_camera(robot: lc.Mechanism, file: Path | None, options: lc.PlanOptions) -> lc.Instrument:
-    """Return a camera at its best station, and print where that is."""
+def _place_camera(
+    robot: lc.Mechanism, file: Path | None, options: lc.PlanOptions, count: int
+) -> lc.Instrument:
+    """Return a camera at its best stations, and print where these are."""
     from loopcal.io.pictures import choose_board, read_board
     from loopcal.measure.kinds.image import Image
-    from loopcal.planning.camera_stations import choose_station
+    from loopcal.planning.camera_stations import choose_stations
 
     if file is None:  # a square is about 1/20 of the robot
         step = 10.0 ** math.floor(math.log10(0.05 * robot.size))
@@ -784,8 +792,11 @@ def _place_camera(robot: lc.Mechanism, file: Path | None, options: lc.PlanOption
     measured = replace(board, measured=board.measured or board.marks)
     camera = Image(corners=board.corners, square=board.square)
     with terminal.TerminalProgress() as progress:
-        instrument, station = choose_station(robot, camera, options, measured.scales, progress)
-    terminal.print_finding(station.code, **station.data)
+        instrument, stations = choose_stations(
+            robot, camera, options, measured.scales, progress, count
+        )
+    for station in stations:
+        terminal.print_finding(station.code, **station.data)
     return instrument
 
 

@@ -540,6 +540,14 @@ def name_poses(paths: Sequence[Path], names: Path | None = None) -> dict[Path, s
     return dict(zip(paths, unique, strict=True))
 
 
+def list_cameras(poses: Path | None) -> dict[str, str]:
+    """Return the cameras of the poses of a table with the column `camera`; empty without one."""
+    table = None if poses is None else read_table(poses)
+    if table is None or "camera" not in table.units:
+        return {}
+    return dict(zip(table.pose_names(), table.text("camera"), strict=True))
+
+
 def refer_to_poses(poses: Path | None, output: Path) -> dict[str, str]:
     """Return the setting by which a measurement file names a table with readings beside it."""
     if poses is None or poses.resolve().parent != output.resolve().parent:
@@ -555,9 +563,11 @@ def format_pictures(
     mount: str,
     sigma: float,
     beside: Mapping[str, str],
+    cameras: Mapping[str, str] | None = None,
 ) -> str:
     """Return the measurement file of the pictures without a fault. mount : of the kind `image`.
-    sigma : [px] of u and v. beside : setting that names the table with the readings.
+    sigma : [px] of u and v. beside : setting that names the table with the readings. cameras : of
+    the poses, stations of one camera with one lens; by default one station.
     """
     good = [picture for picture in pictures if picture.fault is None]
     if not good:
@@ -571,14 +581,21 @@ def format_pictures(
     if focal is not None:
         camera = replace(camera, focal=(focal, focal))
     camera, stated = state_camera(camera, board.scales)
-    known = describe_kind(camera, dict.fromkeys("uv", sigma), np.eye(4), is_noise_assumed=True)
+    of_picture = [(cameras or {}).get(names[picture.path], camera.camera) for picture in good]
+    kinds = {name: replace(camera, camera=name, lens=camera.lens or of_picture[0])
+             for name in dict.fromkeys(of_picture)}  # fmt: skip
+    noise = dict.fromkeys("uv", sigma)
+    described = {name: describe_kind(kind, noise, np.eye(4), is_noise_assumed=True)
+                 for name, kind in kinds.items()}  # fmt: skip
+    known: dict[str, Any] = {"kinds": described} if cameras else described[camera.camera]
     known |= beside
     known["unknowns"] = describe_stated_values(stated, camera.nuisance_parameters)
     lines = [f"# {key}: {format_flow(value)}" for key, value in known.items()]
-    lines.append("pose,corner,u [px],v [px]")
-    for picture in good:
+    lines.append(f"pose,{'camera,' if cameras else ''}corner,u [px],v [px]")
+    for picture, name in zip(good, of_picture, strict=True):
+        first = (names[picture.path], *([name] if cameras else ()))
         for corner, (u, v) in zip(picture.corners, picture.pixels, strict=True):
-            lines.append(format_row((names[picture.path], f"{corner}", f"{u:.3f}", f"{v:.3f}")))
+            lines.append(format_row((*first, f"{corner}", f"{u:.3f}", f"{v:.3f}")))
     return "\n".join(lines) + "\n"
 
 

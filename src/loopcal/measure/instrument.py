@@ -227,10 +227,12 @@ class Instrument:
 
     stated_values : priors of its setup parameters, such as a scale of 2 ppm:
         `StatedValue("position.scale", sd=2e-6)`. A simulation draws the true values from them.
+    has_stations : whether the sensors are stations of one, of which a plan chooses one for a pose.
     """
 
     sensors: tuple[Sensor, ...]
     stated_values: tuple[StatedValue, ...] = ()
+    has_stations: bool = False
 
     def __post_init__(self) -> None:
         set_fields(self, sensors=tuple(self.sensors), stated_values=tuple(self.stated_values))

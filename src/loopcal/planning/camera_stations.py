@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where a camera stands that looks at a printed board on the platform.
+"""Where a camera stands that looks at a printed board on the platform: its stations.
 
 A station lies in a direction from the middle of the places that the board visits, and so far away
 that the picture shows all of these places. The board faces one side of the platform or the other.
-The chosen station has the smallest error that is predicted of the tool over the workspace.
+The chosen station has the smallest error that is predicted of the tool over the workspace, a
+further one with those before. A plan then chooses pictures: poses, each from one of the stations.
 """
 
 from __future__ import annotations
@@ -20,10 +21,12 @@ from loopcal.errors import DataError, EstimationError
 from loopcal.findings import Finding, report_finding
 from loopcal.measure.instrument import Gaussian, Instrument, Sensor
 from loopcal.measure.kinds.image import NARROW, PRINT_SD, Image, state_camera
+from loopcal.measure.nuisance import StatedValue
 from loopcal.mechanism.model import Mechanism
-from loopcal.mechanism.solutions import Solution
+from loopcal.mechanism.solutions import Solution, inverse
 from loopcal.planning.candidates import draw_candidates
 from loopcal.planning.constraints import PlanOptions
+from loopcal.planning.pose_planning import Plan
 from loopcal.planning.problem import prepare_problem
 from loopcal.typing import BoolArray, FloatArray, Progress, report_no_progress
 from loopcal.units import Dimension
@@ -92,17 +95,18 @@ def look_at(station: FloatArray, place: FloatArray) -> FloatArray:
     return geometry.make_pose(np.column_stack([right, np.cross(sight, right), sight]), station)
 
 
-def choose_station(
+def choose_stations(
     robot: Mechanism,
     camera: Image,
     options: PlanOptions | None = None,
     scales: Sequence[tuple[float, float]] = ((0.0, PRINT_SD),) * 2,
     progress: Progress = report_no_progress,
-) -> tuple[Instrument, Finding]:
-    """Return the instrument with the camera at the best station, and where that is.
+    count: int = 1,
+) -> tuple[Instrument, tuple[Finding, ...]]:
+    """Return the instrument with the camera at the best stations, and where these are.
 
     camera : its lens and the board. scales : of the print, see `state_camera`.
-    options : their line of sight fixes the station.
+    options : their line of sight fixes the first station. count : of stations.
 
     DataError : the camera is on the platform, sees no board, or promises no bounded error.
     """
@@ -113,12 +117,30 @@ def choose_station(
     candidates, sight = draw_candidates(robot, options.constraints, DRAWN, options.seed), None
     if options.constraints.sight is not None:
         sight = options.constraints.sight.station
-    poses, noise, every = (
-        candidates.solution,
-        Gaussian(np.full(2, SIGMA)),
-        np.arange(len(candidates)),
-    )
-    views = [_watch(at, poses) for at in list_stations(robot, camera, poses, sight)]
+    poses, chosen = candidates.solution, list[View]()
+    for _ in range(count):
+        views = [_watch(at, poses.T) for at in list_stations(robot, camera, poses, sight)]
+        usable = _select_usable(views)
+        for other in chosen:  # on the same side of the platform, and elsewhere
+            usable = [v for v in usable if (v.camera.T_board == other.camera.T_board).all()
+                      and (v.camera.T_camera != other.camera.T_camera).any()]  # fmt: skip
+        errors = np.full(len(usable), np.inf)
+        for i, view in enumerate(usable):
+            placed = _equip((*chosen, view), stated)
+            with suppress(EstimationError):  # a frame stays open without spreads
+                found = prepare_problem(robot, placed, options, candidates)
+                after = found.predict_errors(np.arange(len(found.groups.rows)))
+                errors[i] = np.inf if after is None else after.select(options.target)
+            progress(i + 1, len(usable), "stations of the camera")
+        if not np.isfinite(errors).any():
+            raise DataError(report_finding("plan.no-station", robot=robot.name))
+        chosen.append(usable[int(np.flatnonzero(errors <= (1.0 + ALIKE) * errors.min())[0])])
+        sight = None
+    return _equip(chosen, stated), tuple(_describe(robot, view) for view in chosen)
+
+
+def _select_usable(views: Sequence[View]) -> list[View]:
+    """Return the views whose pictures can be used, with clear markers if any has these."""
     usable = [view for view in views if view.is_usable.mean() >= USABLE]
     if not usable:
         best = max(views, key=lambda view: view.is_usable.mean())
@@ -126,28 +148,27 @@ def choose_station(
         pixels, tilt = float(np.median(best.pixels)), float(np.median(best.tilt))
         data: dict[str, Any] = {"shown": shown, "pixels": max(pixels, 0.0), "tilt": tilt}
         raise DataError(report_finding("plan.board-unseen", **data))
-    usable = [view for view in usable if view.pixels.min() >= CLEAR] or usable
-    errors = np.full(len(usable), np.inf)
-    for i, view in enumerate(usable):
-        placed = Instrument((Sensor(view.camera, noise),), stated)
-        with suppress(EstimationError):  # a frame stays open without spreads
-            found = prepare_problem(robot, placed, options, candidates).predict_errors(every)
-            errors[i] = np.inf if found is None else found.select(options.target)
-        progress(i + 1, len(usable), "stations of the camera")
-    if not np.isfinite(errors).any():
-        raise DataError(report_finding("plan.no-station", robot=robot.name))
-    best = usable[int(np.flatnonzero(errors <= (1.0 + ALIKE) * errors.min())[0])]
-    return Instrument((Sensor(best.camera, noise),), stated), _describe(robot, best)
+    return [view for view in usable if view.pixels.min() >= CLEAR] or usable
 
 
-def _watch(camera: Image, poses: Solution) -> View:
-    """Return how a camera sees the board at poses."""
-    T = poses.T @ camera.T_board
+def _equip(views: Sequence[View], stated: tuple[StatedValue, ...]) -> Instrument:
+    """Return one camera at the stations of views; the first one gives the lens its name."""
+    first, *others = (view.camera for view in views)
+    kinds = [replace(other, camera=f"{first.camera}{i}", lens=first.lens or first.camera)
+             for i, other in enumerate(others, 2)]  # fmt: skip
+    noise = Gaussian(np.full(2, SIGMA))
+    sensors = tuple(Sensor(kind, noise) for kind in (first, *kinds))
+    return Instrument(sensors, stated, has_stations=bool(kinds))
+
+
+def _watch(camera: Image, poses: FloatArray) -> View:
+    """Return how a camera sees the board at poses (n, 4, 4)."""
+    T = poses @ camera.T_board
     sight = (T @ [*_find_middle(camera), 1.0])[:, :3] - camera.T_camera[:3, 3]
     distance = np.linalg.norm(sight, axis=1)
     cosine = np.clip((T[:, :3, 2] * sight).sum(axis=1) / distance, -1.0, 1.0)
     pixels = camera.square * camera.nominal_lens[0] / distance * cosine
-    each = np.repeat(poses.T, camera.rows_per_pose, axis=0)[None]
+    each = np.repeat(poses, camera.rows_per_pose, axis=0)[None]
     columns = camera.measure(each, np.zeros((1, each.shape[1], 2)))
     seen = camera.hide_unseen(each, columns, camera.nominal_values[None, None])
     corners = camera.detect_present(seen).reshape(len(T), -1, 2).all(axis=2).sum(axis=1)
@@ -173,3 +194,12 @@ def _describe(robot: Mechanism, view: View) -> Finding:
         squares=tuple(n + 1 for n in camera.corners),
         square=robot.to_quantity(camera.square, Dimension.LENGTH),
     )
+
+
+def describe_stations(plan: Plan) -> Iterator[str]:
+    """Yield a line on each station of a camera: where it is, how it sees the board at its poses."""
+    T, cameras = inverse(plan.robot, plan.poses.coordinates).T, np.array(plan.poses.cameras)
+    for kind in (sensor.kind for sensor in plan.instrument.sensors):
+        if isinstance(kind, Image) and kind.mount == "board":
+            own = T[cameras == kind.camera] if len(cameras) else T
+            yield f"{kind.camera}: {_describe(plan.robot, _watch(kind, own))}"

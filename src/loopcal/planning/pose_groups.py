@@ -65,6 +65,12 @@ class GroupRows:
     # (b, o + p) rows of their stated spreads and of targets on the base, which do not depend
     # on the choice of poses
     nuisance_prior: FloatArray
+    # number of stations: all groups from the first one, then from the second ..
+    n_stations: int = 1
+
+    def find_stations(self, groups: IntArray) -> IntArray:
+        """Return the stations (n,) of groups (n,)."""
+        return np.asarray(groups // (len(self.rows) // self.n_stations), dtype=np.intp)
 
     def fold(self) -> tuple[FloatArray, int]:
         """Return the factor (1, p + 1, p + 1) of all that could be measured, without spreads of
@@ -162,11 +168,12 @@ def linearize_groups(
     ]
     stated = nuisance.table.free & ~np.isnan(nuisance.table.tolerance)
     weight = np.where(stated, 1.0 / np.where(stated, nuisance.table.tolerance, 1.0), 0.0)
-    rows = np.concatenate(blocks)
+    rows = np.concatenate(blocks, axis=1)
+    stations, rows = len(rows), rows.reshape(-1, *rows.shape[2:])
     prior = np.zeros((len(nuisance), rows.shape[2]))
     prior[:, : len(nuisance)] = np.diag(weight)
     prior = np.concatenate([prior, _linearize_base(mounted, nuisance, rows.shape[2])])
-    return GroupRows(rows, members, len(nuisance), prior)
+    return GroupRows(rows, np.tile(members, (stations, 1)), len(nuisance), prior, stations)
 
 
 def combine_prior(
@@ -260,7 +267,7 @@ def _linearize_block(
     members: IntArray,
     by_frames: bool,
 ) -> FloatArray:
-    """Return the rows (b, r, o + p) of some groups.
+    """Return the rows (s, b, r, o + p) of some groups from s stations.
 
     Redundant readings with a stated sigma are measured, too. Where they determine the freedoms of
     every pose, the rows are those that remain after elimination of the freedoms.
@@ -309,16 +316,21 @@ def _linearize_block(
     whitened = observe_rows(columns, data, nuisance, nuisance.values())[0, :, :-1]
     counts = [len(part) * len(part.kind.noise_columns) for part in observations]
     pieces = np.split(whitened, np.cumsum(counts)[:-1])
-    by_group = (piece.reshape(len(members), -1, whitened.shape[1]) for piece in pieces)
-    rows = np.concatenate(list(by_group), axis=1)
-    rows[unusable | ~observed.is_reached[places].all(axis=1)] = np.nan
+    by_group = [piece.reshape(len(members), -1, whitened.shape[1]) for piece in pieces]
+    read = by_group[-1:] if is_redundant and mounted.has_stations else []
+    views = [[v, *read] for v in by_group[: len(by_group) - len(read)]]
+    views = views if mounted.has_stations else [by_group]
+    rows = np.stack([np.concatenate(view, axis=1) for view in views])
+    rows[:, unusable | ~observed.is_reached[places].all(axis=1)] = np.nan
     if not is_redundant:
         return rows
+    stacked, rows = rows.shape[:2], rows.reshape(-1, *rows.shape[2:])
     count = size * len(robot.freedoms)
     kept, freedoms = np.split(rows, [rows.shape[2] - count], axis=2)
     nothing = np.zeros((*rows.shape[:2], 1))  # residuals, which a plan does not have
     done = eliminate_columns(np.concatenate([freedoms, kept, nothing], axis=2), count)
-    return done.rest[:, count if done.is_observable.all() else 0 :, :-1]
+    rest = done.rest[:, count if done.is_observable.all() else 0 :, :-1]
+    return rest.reshape(*stacked, *rest.shape[1:])
 
 
 def count_poses_per_group(instrument: Instrument) -> int:

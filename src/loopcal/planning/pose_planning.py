@@ -65,6 +65,7 @@ class PlannedPoses:
     groups: IntArray  # (u, k) indices of the poses that are measured together
     # from home through all poses [m], rotations times the robot's size
     path_length: float | None = None
+    cameras: tuple[str, ...] = ()  # (m,) whose stations they are seen from; () for one
 
     def __len__(self) -> int:
         return len(self.labels)
@@ -202,10 +203,11 @@ class Plan(DrawnResult):
         assert poses.path_length is not None, "a plan has a path"
         efficiency = self.quality.efficiency
         what: dict[str, Any] = {"robot": self.robot.name, "poses": len(poses)}
-        what["kinds"] = tuple(
+        kinds = (
             f"{kind.name} of targets on the base" if kind.is_of_base else kind.name
             for kind in (sensor.kind for sensor in self.instrument.sensors)
         )
+        what["kinds"] = tuple(dict.fromkeys(kinds))
         path = report_finding(
             "plan.path", length=Quantity(poses.path_length, "m"), via_home=int(poses.via_home.sum())
         )
@@ -438,26 +440,35 @@ def _arrange_poses(
     whether the search for a short order came to its end.
     """
     robot, members, candidates = problem.robot, problem.groups.members, problem.candidates
-    selected = members[np.concatenate([chosen, held_out])]
-    poses = np.unique(selected)
-    visit = order_poses(candidates.checker, candidates.coordinates[poses])
-    ordered = poses[visit.order]
-    place = np.empty(len(candidates), dtype=np.int64)
-    place[ordered] = np.arange(len(ordered))
+    groups, count = np.concatenate([chosen, held_out]), problem.groups.n_stations
+    selected, station_of = members[groups], problem.groups.find_stations(groups)
+    place = np.empty((count, len(candidates)), dtype=np.int64)
+    ordered, stations, visits = place[0, :0], place[0, :0], []
+    for station in np.unique(station_of):  # one after the other
+        poses = np.unique(selected[station_of == station])
+        visits.append(order_poses(candidates.checker, candidates.coordinates[poses]))
+        place[station, poses[visits[-1].order]] = len(ordered) + np.arange(len(poses))
+        ordered = np.append(ordered, poses[visits[-1].order])
+        stations = np.append(stations, np.full(len(poses), station))
     readings = candidates.solution.q[ordered]
     # no instrument resolves the difference
     steps = list_steps(robot, [a.dimension for a in robot.actuators], DIGITS)
+    names = [getattr(sensor.kind, "camera", "") for sensor in problem.instrument.sensors]
     numbers = [int(name) for name in problem.used_names if name.isdecimal()]
     planned = PlannedPoses(
         tuple(str(max(numbers, default=0) + i) for i in range(1, len(ordered) + 1)),
         candidates.coordinates[ordered],
         np.round(readings / steps) * steps + 0.0,  # + 0: no reading is -0
         np.isin(ordered, members[held_out]),
-        visit.via_home,
-        place[selected],
-        visit.length,
+        np.concatenate(
+            [np.append(i or v.via_home[0], v.via_home[1:]) for i, v in enumerate(visits)]
+        )
+        > 0,
+        place[station_of[:, None], selected],
+        sum(visit.length for visit in visits),
+        tuple(names[i] for i in stations) if count > 1 else (),
     )
-    return planned, visit.is_converged
+    return planned, all(visit.is_converged for visit in visits)
 
 
 def _collect_notes(problem: PlanningProblem) -> list[Finding]:

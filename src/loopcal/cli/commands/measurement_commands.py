@@ -451,6 +451,7 @@ def _write_plan(
     """Write the folder of a plan; return its files in words."""
     from loopcal.io.core.outputs import write_result_folder
     from loopcal.io.runs import plan_folder
+    from loopcal.planning.camera_stations import describe_stations
     from loopcal.planning.pose_planning import list_stops
     from loopcal.report.figures.result_figures import draw_curve, draw_plan
     from loopcal.report.pictures import render_figure
@@ -458,7 +459,9 @@ def _write_plan(
     figures = {}
     if isinstance(result, lc.Plan):
         texts = {
-            plan_folder.SHEET: plan_folder.format_sheet(result, list_stops(result)),
+            plan_folder.SHEET: plan_folder.format_sheet(
+                result, list_stops(result), describe_stations(result)
+            ),
             plan_folder.DATA: plan_folder.format_plan_data(result),
         }
         if any(sensor.kind.label_count for sensor in result.instrument.sensors):
@@ -625,7 +628,9 @@ def photos(
             progress(len(found), len(paths), "finding corners")
     pictures = of.compare_pictures([found[path] for path in paths])
     texts = {
-        output: of.format_pictures(known, pictures, names, mount, sigma, beside),
+        output: of.format_pictures(
+            known, pictures, names, mount, sigma, beside, of.list_cameras(poses)
+        ),
         page_file: of.format_contact_sheet(pictures, names, fitted),
     }
     write_files({file: texts[file] for file in written})

@@ -270,11 +270,15 @@ RULES: tuple[ColumnRule, ...] = (
     _text_rule("poses of a block are never split between fit and validation", BLOCK_COLUMN),
     _text_rule("label of the kind, in files with several kinds", TextColumn("kind")),
     ColumnRule(
-        "camera, board",
+        "camera, board, picture",
         "",
         "of the kind image: its settings of these names, by which a row belongs to one of several "
-        "kinds without the column `kind`",
-        lambda _, kinds: [TextColumn(name) for kind in kinds for name in kind.row_settings],
+        "kinds without the column `kind`. In a table of poses: station and file of each picture",
+        lambda _, kinds: [
+            TextColumn(name)
+            for names in ([kind.row_settings for kind in kinds] or [("camera", "picture")])
+            for name in names
+        ],
     ),
     _text_rule("rows of a session share unknown frames and targets", TextColumn("session")),
     _text_rule("rows of a group share a surface or the constant of a lock", TextColumn("group")),

@@ -58,7 +58,11 @@ def read_stops(path: str | Path, robot: Mechanism) -> Stops:
             raise table.row_error(row, f"the use {use!r} is not {FIT}, {HELD_OUT} or {VIA}")
     columns = [table.numbers(n, get_dimension(n), empty=False) for n in robot.controlled]
     _require_words(robot)
-    return table.pose_names(), uses, np.column_stack(columns)
+    labels: Sequence[str] = table.pose_names()
+    if "camera" in table.units:
+        cameras = table.text("camera")
+        labels = [f"{label} from {at}" for label, at in zip(labels, cameras, strict=True)]
+    return labels, uses, np.column_stack(columns)
 
 
 def format_gcode(

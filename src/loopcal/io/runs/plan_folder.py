@@ -15,7 +15,7 @@ measured.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -42,6 +42,7 @@ if TYPE_CHECKING:
 FORMAT = 1
 SHEET, DATA, RESULT = "plan.csv", "measurements.csv", "plan.json"
 POSES = "poses.csv"
+CAMERAS = ("camera",)  # column of the stations of a camera, where there are several
 FILES = (SHEET, DATA, POSES, "plan.png", "curve.png")
 PLAN = FolderKind("plan", RESULT, ("robot", "made_by"), FILES)
 VIA = "via"
@@ -58,10 +59,10 @@ INSTRUCTIONS = """\
 ## plane and on the line. All numbers here are nominal values."""
 
 
-def format_sheet(plan: Plan, stops: Sequence[Stop]) -> str:
+def format_sheet(plan: Plan, stops: Sequence[Stop], stations: Iterable[str] = ()) -> str:
     """Return the operator's sheet: the stops in order, with home where a straight path is blocked.
 
-    `stops` are those of `loopcal.planning.pose_planning.list_stops`.
+    `stops` are those of `loopcal.planning.pose_planning.list_stops`, `stations` lines on cameras.
     """
     robot = plan.robot
     headers, factors = _list_columns(robot)
@@ -69,16 +70,19 @@ def format_sheet(plan: Plan, stops: Sequence[Stop]) -> str:
     names = [name for name in robot.controlled if name not in ("phi", "theta")]
     tilt = ["theta*cos(phi)", "theta*sin(phi)"] if "phi" in robot.controlled else []
     path = ", ".join([*names, *tilt])
+    cameras = dict(zip(plan.poses.labels, plan.poses.cameras, strict=False))
     lines = [
         f"## Poses of {robot.name} to measure in this order, starting from home.",
         f"## Between two poses move straight in {path}. Measure {FIT} and",
         f"## {HELD_OUT} poses alike; only pass through {VIA} poses.",
-        format_row(["step", "pose", USE_COLUMN.name, *headers]),
+        *(f"## {line}" for line in stations),
+        format_row(["step", "pose", USE_COLUMN.name, *CAMERAS[: len(cameras)], *headers]),
     ]
     for step, stop in enumerate(stops, 1):
         use = VIA if stop.is_via else HELD_OUT if stop.is_held_out else FIT
         numbers = map(_format, (*stop.coordinates, *stop.readings), factors)
-        lines.append(format_row([str(step), stop.label, use, *numbers]))
+        seen_from = [cameras.get(stop.label, "")] if cameras else []
+        lines.append(format_row([str(step), stop.label, use, *seen_from, *numbers]))
     return "\n".join(lines) + "\n"
 
 
@@ -91,6 +95,12 @@ def format_plan_data(plan: Plan) -> str:
         replace(s, rows=plan.poses.groups) if s.kind.poses_per_row > 1 else s
         for s in plan.instrument.sensors
     )
+    if cameras := plan.poses.cameras:
+        rows = [np.flatnonzero(np.array(cameras) == getattr(s.kind, "camera", "")) for s in sensors]
+        sensors = tuple(
+            replace(s, rows=np.repeat(own, s.kind.rows_per_pose))
+            for s, own in zip(sensors, rows, strict=True)
+        )
     factors = _list_columns(plan.robot)[1][-len(plan.robot.actuators) :]
     readings = np.array(
         [
@@ -109,9 +119,10 @@ def format_poses(plan: Plan) -> str:
     """Return names, uses and readings of the poses, in the order of visiting."""
     count, poses = len(plan.robot.actuators), plan.poses
     headers, factors = _list_columns(plan.robot)
-    rows = zip(poses.labels, poses.uses, poses.readings.tolist(), strict=True)
-    lines = [format_row(["pose", USE_COLUMN.name, *headers[-count:]])]
-    lines += [format_row([name, use, *map(_format, q, factors[-count:])]) for name, use, q in rows]
+    texts = (poses.labels, poses.uses, *filter(None, [poses.cameras]))
+    lines = [format_row(["pose", USE_COLUMN.name, *CAMERAS[: len(texts) - 2], *headers[-count:]])]
+    rows = zip(*texts, poses.readings.tolist(), strict=True)
+    lines += [format_row([*words, *map(_format, q, factors[-count:])]) for *words, q in rows]
     return "\n".join(lines) + "\n"
 
 
