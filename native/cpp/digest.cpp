@@ -30,6 +30,11 @@ int loopcal_reach(int, const int64_t *, const double *, const loopcal::Strided *
 int loopcal_compare_poses(int, const loopcal::Strided *, double *, double *, int64_t, int64_t);
 int loopcal_solve_triangles(int, const double *, const double *, double *, double *, int64_t,
                             int64_t);
+int loopcal_locate_points(int, const loopcal::Strided *, const double *, const int64_t *, double *,
+                          double *, int64_t, int64_t, int64_t);
+int loopcal_eliminate_blocks(int, const loopcal::BlockStructure *, int64_t, const loopcal::BlockRows *,
+                             int64_t, int64_t, int64_t, int64_t, double, double *, double *, double *,
+                             double *, int8_t *);
 int loopcal_solve(int, const int64_t *, const double *, const loopcal::Strided *,
                   const loopcal::Strided *, int64_t, int64_t, int64_t, int, loopcal::Task, void *,
                   double *, double *const *, double *, int64_t *, int8_t *, int8_t *);
@@ -333,6 +338,55 @@ void add_comparisons(int set, int64_t n, Digest &digest) {
     digest.add(residual), digest.add(by_twist);
 }
 
+void add_points(int set, int64_t n, int64_t k, Digest &digest) {
+    Random random;
+    Reals poses, frames = random.reals((size_t)(6 * n), 2.0), points = random.reals((size_t)(3 * n * k), 1.0);
+    Reals stated, x((size_t)(3 * n * k));
+    for (int64_t i = 0; i <= n; i++) {
+        Reals R, &to = i < n ? poses : stated;
+        add_rotation(random, R);
+        for (int row = 0; row < 3; row++) {
+            to.insert(to.end(), R.begin() + 3 * row, R.begin() + 3 * row + 3);
+            to.push_back(random());
+        }
+        to.insert(to.end(), {0, 0, 0, 1});
+    }
+    for (bool framed : {true, false}) {
+        const int64_t columns[] = {framed ? 6 : -1, framed ? 12 : 6, (framed ? 12 : 6) + 3 * k};
+        Reals slopes((size_t)(3 * n * k * columns[2]));
+        loopcal::Strided arrays[] = {{poses.data(), 0, 16},
+                                     {framed ? frames.data() : nullptr, 0, 6},
+                                     {points.data(), 0, 3 * k}};
+        loopcal_locate_points(set, arrays, stated.data(), columns, x.data(), slopes.data(), 1, n, k);
+        digest.add(x), digest.add(slopes);
+    }
+}
+
+// Two sessions of two unknowns, with two groups of three each, in `t` trials.
+void add_blocks(int set, int64_t t, int64_t height, int64_t right, Digest &digest) {
+    Random random;
+    const int64_t sessions[] = {0, 1, 2, 3}, none[] = {-1, -1}, session_of[] = {0, 0, 1, 1};
+    const int64_t groups[] = {4, 5, 6, 0, 1, 7, 8, 9, 0, 1, 10, 11, 12, 2, 3, 13, 14, 15, 2, 3};
+    const int64_t place[] = {0, 1, 2, 3}, columns[] = {0, 1, 2, 3, 4, 4, 3, 2, 1, 0, 0, 1, 2, 3, 4, 0, 1, 2, 3, 4};
+    Reals inverse((size_t)(t * 44)), solution((size_t)(t * (4 * right + 12 * (2 + right))));
+    double *inverses = inverse.data(), *solutions = solution.data();
+    const loopcal::BlockStructure structures[] = {
+        {2, 2, 2, -1, sessions, none, inverses, solutions},
+        {4, 3, 5, 0, groups, session_of, inverses + 8 * t, solutions + 4 * right * t}};
+    Reals by_unknowns = random.reals((size_t)(t * 4 * height * 5), 1.0);
+    Reals machine = random.reals((size_t)(t * 4 * height * right), 1.0);
+    const loopcal::BlockRows rows{1, 4, height, 5, place, columns, {by_unknowns.data(), 20 * height, 5},
+                                  {machine.data(), 4 * height * right, right}};
+    Reals factor((size_t)(t * right * right)), values((size_t)(t * 16 * right)), length((size_t)(16 * t));
+    Reals explained((size_t)t);
+    std::vector<int8_t> is_regular((size_t)t);
+    loopcal_eliminate_blocks(set, structures, 2, &rows, 1, t, 16, right, 1e-10, factor.data(), values.data(),
+                             length.data(), explained.data(), is_regular.data());
+    for (const Reals *numbers : {&inverse, &solution, &factor, &values, &length, &explained})
+        digest.add(*numbers);
+    digest.add(is_regular);
+}
+
 }  // namespace
 
 int main() {
@@ -348,6 +402,8 @@ int main() {
             for (int64_t n : {3, 21}) add_sums(set, 5, n, order, digest);
         for (bool torsion : {false, true}) add_targets(set, 5, 45, torsion, digest);
         for (int64_t n : {1, 13, 50}) add_comparisons(set, n, digest);
+        for (int64_t k : {1, 3}) add_points(set, 21, k, digest);
+        for (int64_t height : {5, 40}) add_blocks(set, 3, height, 9, digest);
         for (int64_t p : {1, 7, 43}) add_factors(set, 11, 50, p, digest);
         add_factors(set, 3, 1000, 7, digest);
         std::printf("%016llx %s\n", (unsigned long long)digest.value, name);

@@ -26,7 +26,7 @@ extern const loopcal::Kernels kernels;
 
 namespace {
 
-constexpr int ABI = 12;  // changes with every change of the C interface; library.py states it, too
+constexpr int ABI = 13;  // changes with every change of the C interface; library.py states it, too
 
 struct Set {
     const char *name;
@@ -121,6 +121,22 @@ EXPORT int loopcal_compare_poses(int set, const loopcal::Strided *arrays, double
 EXPORT int loopcal_solve_triangles(int set, const double *triangle, const double *right, double *x,
                                    double *growth, int64_t t, int64_t p) {
     return list_sets()[set].kernels->solve_triangles(triangle, right, x, growth, t, p);
+}
+
+EXPORT int loopcal_locate_points(int set, const loopcal::Strided *arrays, const double *stated,
+                                 const int64_t *columns, double *x, double *slopes, int64_t t, int64_t n,
+                                 int64_t k) {
+    return list_sets()[set].kernels->locate_points(arrays, stated, columns, x, slopes, t, n, k);
+}
+
+EXPORT int loopcal_eliminate_blocks(int set, const loopcal::BlockStructure *structures, int64_t count,
+                                    const loopcal::BlockRows *parts, int64_t pieces, int64_t t,
+                                    int64_t unknowns, int64_t right, double limit, double *factor,
+                                    double *values, double *length, double *explained,
+                                    int8_t *is_regular) {
+    return list_sets()[set].kernels->eliminate_blocks(structures, count, parts, pieces, t, unknowns, right,
+                                                      limit, factor, values, length, explained,
+                                                      is_regular);
 }
 
 EXPORT int loopcal_solve(int set, const int64_t *structure, const double *numbers,

@@ -148,10 +148,16 @@ inline size_t need_by_columns(int64_t p) {
     return Arena::need<double>(p * padded(p)) + Arena::need<double>(ROWS * padded(p));
 }
 
-INLINE void fold_block_by_columns(double *factor, double *block, int64_t p) {
-    int64_t width = padded(p);
-    for (int64_t k = 0; k < p; k++) {
+// The first `count` columns are reflected. Before, row k < `begun` of the block becomes row k of the
+// factor, which is zero.
+INLINE void fold_block_by_columns(double *factor, double *block, int64_t count, int64_t width,
+                                  int64_t begun) {
+    for (int64_t k = 0; k < count; k++) {
         double *row = factor + k * width, v[ROWS];
+        if (k < begun) {
+            std::memcpy(row, block + k * width, sizeof(double) * (size_t)width);
+            std::memset(block + k * width, 0, sizeof(double) * (size_t)width);
+        }
         for (int i = 0; i < ROWS; i++) v[i] = block[i * width + k];
         Reflection<double> h = reflect(row[k], v);
         // columns before k are zero in all these rows
@@ -181,7 +187,7 @@ inline void fold_trial(const double *factor, const double *rows, double *out, in
         std::memset(block, 0, sizeof(double) * (size_t)(ROWS * width));
         for (int64_t i = 0; i < height; i++)
             std::memcpy(block + i * width, rows + (first + i) * p, sizeof(double) * (size_t)p);
-        fold_block_by_columns(R, block, p);
+        fold_block_by_columns(R, block, p, width, 0);
     }
     for (int64_t i = 0; i < p; i++)
         for (int64_t j = 0; j < p; j++) out[i * p + j] = j < i ? 0.0 : R[i * width + j];

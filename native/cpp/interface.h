@@ -38,6 +38,24 @@ struct TwistRows {
     Strided by_twist, residual;
 };
 
+// `count` blocks of `own` unknowns each, and the results of t trials. path : (count, width) numbers of
+// their unknowns, then of those of their ancestors. parent : number of the structure of the parents, -1
+// for none; parent_place : (count,) places there. inverse : (t, count, own, own). solution : (t, count,
+// own, width - own + p + 1).
+struct BlockStructure {
+    int64_t count, own, width, parent;
+    const int64_t *path, *parent_place;
+    double *inverse, *solution;
+};
+
+// `count` sets of `height` rows of blocks of one structure, see loopcal.engine.BlockRows. place :
+// (count,) block of each set; columns : (count, used). Rows are `pose` numbers apart.
+struct BlockRows {
+    int64_t structure, count, height, used;
+    const int64_t *place, *columns;
+    Strided by_unknowns, machine;
+};
+
 // T (t, n, 4, 4), joints of each group, and (t, n): residual, status, sign, whether the joints lead
 // there.
 struct ReachOutput {
@@ -112,6 +130,14 @@ struct Kernels {
     // see triangles.h
     int (*solve_triangles)(const double *triangle, const double *right, double *x, double *growth,
                            int64_t t, int64_t p);
+    // arrays, stated, columns : see points.h
+    int (*locate_points)(const Strided *arrays, const double *stated, const int64_t *columns, double *x,
+                         double *slopes, int64_t t, int64_t n, int64_t k);
+    // see eliminate.h
+    int (*eliminate_blocks)(const BlockStructure *structures, int64_t count, const BlockRows *parts,
+                            int64_t pieces, int64_t t, int64_t unknowns, int64_t right, double limit,
+                            double *factor, double *values, double *length, double *explained,
+                            int8_t *is_regular);
     int (*solve)(const int64_t *structure, const double *numbers, const Strided *arrays,
                  const Strided *joints, int64_t t, int64_t n, int64_t max_iterations, int order,
                  Task task, void *context, double *T, double *const *joints_out, double *residual,

@@ -4,10 +4,12 @@
 #include "certify.h"
 #include "compare.h"
 #include "compared.h"
+#include "eliminate.h"
 #include "fold.h"
 #include "fold_poses.h"
 #include "interface.h"
 #include "linearize.h"
+#include "points.h"
 #include "sensitivity.h"
 #include "solve.h"
 #include "targets.h"
@@ -36,6 +38,7 @@ static int call_solve(const int64_t *structure, const double *numbers,
 
 extern const loopcal::Kernels kernels;
 const loopcal::Kernels kernels = {fold,          call_linearize, certify,         reach,     differentiate,
-                                   fold_poses,    fold_compared,  compare_poses,   solve_triangles, call_solve};
+                                   fold_poses,    fold_compared,  compare_poses,   solve_triangles,
+                                   locate_points, eliminate_blocks, call_solve};
 
 }  // namespace INSTRUCTION_SET

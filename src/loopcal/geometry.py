@@ -16,6 +16,7 @@ from itertools import permutations, product
 
 import numpy as np
 
+from loopcal import engine
 from loopcal.errors import DataError
 from loopcal.numerics.decomposition import are_nonzero
 from loopcal.typing import FloatArray, IntArray
@@ -745,7 +746,8 @@ def solve_frame_and_points(
     known = np.where(is_there, measured, 0.0)
     M = (np.eye(3)[:, :, None] * known[:, :, None, None, :]).reshape(s, 3 * q, 9)
     b = (constant * is_there).reshape(s, 3 * q, 1)
-    both = np.concatenate([M, b], axis=-1)
+    rows = engine.fold(np.zeros((s, w + 13, w + 13)), np.concatenate([C, M, b], axis=-1))
+    C, both, M, b = rows[..., : w + 3], rows[..., w + 3 :], rows[..., w + 3 : -1], rows[..., -1:]
     Q, size, V = np.linalg.svd(C, full_matrices=False)
     used = are_nonzero(size, ALIGNMENT_TOLERANCE)[:, None, :]
     Q = Q * used

@@ -250,7 +250,8 @@ class CountedProblem:
 def test_one_wire_with_an_unknown_anchor_converges_by_least_squares():
     """A 3-PRS with 9 of 33 directions undetermined and others hardly: scipy needs more evaluations
     and finds the same minimum. Ends whose further steps would change the residuals by 1e-9 of
-    themselves take one evaluation more than the 15 of ends at 1e-6."""
+    themselves take one evaluation more than the 15 of ends at 1e-6. Rounding alone changes the
+    median: 13 to 17 of three draws of machines."""
     robot, t = load_robot("3-prs"), 10
     count = np.zeros(t, dtype=int)
     place, anchor = np.array([[0.05, 0.02, 0.0]]), np.array([1.0, -0.6, 0.2])
@@ -262,7 +263,7 @@ def test_one_wire_with_an_unknown_anchor_converges_by_least_squares():
     counted, p = CountedProblem(problem, count, np.arange(t)), problem.parameters
     fit = descend(counted, np.zeros((t, p)), LeastSquares())
     assert (fit.status == DescentStatus.CONVERGED).mean() >= 0.95
-    assert np.median(count) <= 16
+    assert np.median(count) <= 18
     one = problem.take(np.array([5]))
 
     @lru_cache(1)

@@ -10,6 +10,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import loopcal.estimate.pose_rows as blocks_module
+from loopcal.engine import BlockRows
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.identification import identify
 from loopcal.estimate.information import observe_poses, observe_rows
@@ -24,7 +25,7 @@ from loopcal.numerics.elimination import (
     NodeFactors,
     build_tree,
     eliminate_tree,
-    shorten_rows,
+    fill_rows,
 )
 from tests import zoo
 from tests.estimate.problems import hexapod, hexapod_poses
@@ -94,11 +95,10 @@ def fold_problem(problem, tree):
             used = np.array([x for x in problem.sets[i] if problem.free[x]], dtype=np.int64)
             if len(used):
                 node, some = tree.node[used].max(), of == i
-                width, k = int(tree.width[node]), int(some.sum())
-                rows = np.zeros((1, k, width + right.shape[1]))
-                rows[0][:, tree.columns(np.array([node]), used[None])[0]] = F[np.ix_(some, used)]
-                rows[0, :, width:] = right[some]
-                factors.add(int(tree.structure[node]), rows, np.full(k, tree.place[node]))
+                columns = tree.columns(np.array([node]), used[None])
+                own, place = F[np.ix_(some, used)], tree.place[[node]]
+                at = int(tree.structure[node]), place, columns
+                factors.add(BlockRows(*at, own[None, None], right[some][None, None]))
     return factors
 
 
@@ -276,12 +276,12 @@ def linearize_nominal(data):
 def test_cost_of_planes_that_share_a_probe_is_linear_in_their_number(monkeypatch):
     counted, add = {"rows": 0, "kept": 0, "widest": 0}, NodeFactors.add
 
-    def counting(self, structure, rows, places):
-        add(self, structure, rows, places)
+    def counting(self, rows):
+        add(self, rows)
         if self.parameters:
-            kept = sum(factor.size for factor in self.arrays())
-            widest = max(counted["widest"], rows.shape[2])
-            counted.update(rows=counted["rows"] + rows.size, kept=kept, widest=widest)
+            filled, kept = fill_rows(rows, self.tree), sum(factor.size for factor in self.arrays())
+            widest = max(counted["widest"], filled.shape[2])
+            counted.update(rows=counted["rows"] + filled.size, kept=kept, widest=widest)
 
     monkeypatch.setattr(NodeFactors, "add", counting)
     result = []
@@ -352,25 +352,3 @@ def test_fit_of_planes_that_share_a_probe_converges():
     assert (
         fit.rank == 30
     )  # of 42, less the frames of the base and of the tool: the probe and the planes are free
-
-
-def test_rows_of_many_targets_are_folded_by_their_own_columns():
-    """The factor of the shorter rows is that of all rows; three components of each target use
-    three columns of their own and six of the frame.
-    """
-    rng = np.random.default_rng(0)
-    k, targets, frame, p = 40, 12, 6, 5
-    width = frame + 3 * targets
-    rows = np.zeros((1, k, 3 * targets, width + p + 1))
-    rows[..., :frame] = rng.standard_normal((*rows.shape[:3], frame))
-    rows[..., width:] = rng.standard_normal((*rows.shape[:3], p + 1))
-    for j in range(targets):
-        own = slice(frame + 3 * j, frame + 3 * j + 3)
-        rows[:, :, 3 * j : 3 * j + 3, own] = rng.standard_normal((1, k, 3, 3))
-    flat = rows.reshape(1, -1, width + p + 1)
-    short = shorten_rows(flat, width)
-    assert short.shape[1] < 0.3 * k * 3 * targets
-    assert_allclose(short[0].T @ short[0], flat[0].T @ flat[0], atol=1e-10)
-    few = np.concatenate([rows[:, :, :6, :12], rows[:, :, :6, width:]], axis=3)
-    few = few.reshape(1, -1, few.shape[3])
-    assert shorten_rows(few, 12) is few

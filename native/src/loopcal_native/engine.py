@@ -13,14 +13,17 @@ from numpy.typing import NDArray
 from loopcal.engine import (
     Advanced,
     Block,
+    BlockRows,
     ClosureBlocks,
     ComparedPoses,
+    EliminatedBlocks,
     Engine,
     ParameterMap,
     Program,
     Reached,
     State,
     Steps,
+    Structure,
     Sums,
     Target,
     Task,
@@ -57,7 +60,7 @@ from loopcal_native.library import (
 )
 from loopcal_native.library import ComparedPoses as ComparedPosesOfLibrary
 from loopcal_native.library import Steps as StepsOfLibrary
-from loopcal_native.pose_rows import flatten_rows
+from loopcal_native.pose_rows import describe_blocks, flatten_rows
 from loopcal_native.programs import flatten_program, require
 from loopcal_native.tasks import NO_TASK, MoveCalls, TaskCalls
 from loopcal_native.version import VERSION
@@ -80,7 +83,7 @@ def make_engine(variant: str = "") -> Engine:
     own = NativeFunctions(sets[name])
     functions = own.solve, own.certify, own.reach, own.linearize, own.fold
     functions += own.differentiate, own.fold_poses, own.solve_triangles, own.compare_poses
-    functions += own.follow, own.fold_compared
+    functions += own.follow, own.fold_compared, own.eliminate_blocks, own.locate_points
     return Engine(f"native:{name}", VERSION, *functions)
 
 
@@ -434,6 +437,66 @@ class NativeFunctions:
         others = status, residual, iterations, sign, tuple(joints[groups:])
         state, end = State(T, tuple(joints[:groups]), *others), taken.taken + 1
         return Advanced(state, out, is_finite, deviations[:end], costs[:end], taken.change)
+
+    def locate_points(
+        self,
+        T: FloatArray,
+        stated: FloatArray,
+        frame: FloatArray | None,
+        points: FloatArray,
+        columns: tuple[int, int, int],
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return points of the platform in a frame, and their derivatives."""
+        k, arrays = points.shape[2], [as_reals(T), None if frame is None else as_reals(frame)]
+        arrays.append(as_reals(points).reshape(*points.shape[:2], 3 * k))
+        shapes = [a.shape[:2] for a in arrays if a is not None]
+        t, n = shape = max(s[0] for s in shapes), max(s[1] for s in shapes)
+        ends = ("poses", (4, 4)), ("frames", (6,)), ("points", (3 * k,))
+        for (name, end), array in zip(ends, arrays, strict=True):
+            if array is not None:
+                require_rows(name, array, end, shape)
+        of_frame, of_points, width = columns
+        is_right = of_frame < 0 or (6 <= of_frame <= width - 6 and frame is not None)
+        is_right = is_right and width >= 6 and (of_points < 0 or 6 <= of_points <= width - 3 * k)
+        require(is_right and stated.shape == (4, 4), f"a frame (4, 4), and columns of {width}")
+        stated, listed = as_reals(stated), np.array(columns, np.int64)
+        x, slopes = np.empty((t, n, k, 3)), np.empty((t, n, k, 3, width))
+        addresses = locate(stated), locate(listed), locate(x), locate(slopes)
+        if t * n:
+            call = load_library().loopcal_locate_points
+            require_done(call(self.instruction_set, describe_all(arrays), *addresses, t, n, k))
+        return x, slopes
+
+    def eliminate_blocks(
+        self,
+        structures: Sequence[Structure],
+        rows: Sequence[BlockRows],
+        shape: tuple[int, int, int],
+        limit: float,
+    ) -> EliminatedBlocks:
+        """Eliminate all unknowns from whitened rows, the innermost blocks first."""
+        t, U, q = shape[0], shape[1], shape[2] + 1
+        blocks = describe_blocks(structures, rows, (t, U, q))
+        factor, values, length, explained, is_regular = allocate(
+            *(((t, q, q), float), ((t, U, q), float), ((t, U), float), ((t,), float)),
+            ((t,), np.bool_),
+        )
+        values[:] = 0.0  # of unknowns without a block
+        call, addresses = (
+            load_library().loopcal_eliminate_blocks,
+            (factor, values, length, explained),
+        )
+        outcome = call(
+            self.instruction_set,
+            blocks.structures,
+            len(structures),
+            blocks.rows,
+            len(rows),
+            *(t, U, q, limit),
+            *(locate(a) for a in (*addresses, is_regular)),
+        )
+        require_done(outcome)
+        return EliminatedBlocks(*addresses, is_regular, blocks.solutions)
 
     def solve_triangles(
         self, triangle: FloatArray, right: FloatArray

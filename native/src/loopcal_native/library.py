@@ -13,7 +13,7 @@ import numpy as np
 
 from loopcal.engine import Steps as StepsOfEngine
 
-ABI = 12
+ABI = 13
 """The C interface that this package calls; dispatch.cpp states it, too."""
 APART, CHAINED, ENDING = 0, 1, 2
 """Where `loopcal_solve` begins the poses of a trial; interface.h states it, too."""
@@ -78,6 +78,25 @@ class Steps(ctypes.Structure):
     )
 
 
+class BlockStructure(ctypes.Structure):
+    """Blocks of unknowns and what is solved for them, see interface.h."""
+
+    _fields_ = (
+        *((name, COUNT) for name in ("count", "own", "width", "parent")),
+        *((name, ADDRESS) for name in ("path", "parent_place", "inverse", "solution")),
+    )
+
+
+class BlockRows(ctypes.Structure):
+    """Rows of blocks, see interface.h."""
+
+    _fields_ = (
+        *((name, COUNT) for name in ("structure", "count", "height", "used")),
+        *((name, ADDRESS) for name in ("place", "columns")),
+        *((name, Strided) for name in ("by_unknowns", "machine")),
+    )
+
+
 class ReachOutput(ctypes.Structure):
     """Addresses of what `loopcal_reach` returns, in the order of interface.h."""
 
@@ -127,6 +146,9 @@ def load_library() -> ctypes.CDLL:
     library.loopcal_fold_compared.argtypes += (ctypes.POINTER(Steps),)
     library.loopcal_compare_poses.argtypes = (INT, *(ADDRESS,) * 3, *(COUNT,) * 2)
     library.loopcal_solve_triangles.argtypes = (INT, *(ADDRESS,) * 4, *(COUNT,) * 2)
+    library.loopcal_locate_points.argtypes = (INT, *(ADDRESS,) * 5, *(COUNT,) * 3)
+    library.loopcal_eliminate_blocks.argtypes = (INT, ADDRESS, COUNT, ADDRESS, *(COUNT,) * 4)
+    library.loopcal_eliminate_blocks.argtypes += (ctypes.c_double, *(ADDRESS,) * 5)
     library.loopcal_solve.argtypes = (INT, *(ADDRESS,) * 4, *(COUNT,) * 3)
     library.loopcal_solve.argtypes += (INT, TASK, *(ADDRESS,) * 7)
     return library

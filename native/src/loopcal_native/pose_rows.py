@@ -1,16 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rows of poses as the library reads them: all kinds of rows pose by pose."""
+"""Rows of poses as the library reads them, all kinds of rows pose by pose, and rows of blocks."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from loopcal.engine import TwistRows
+from loopcal.engine import BlockRows, Structure, TwistRows
 from loopcal.typing import FloatArray, IntArray
-from loopcal_native.library import Strided, as_reals, locate
+from loopcal_native.library import BlockRows as RowsOfLibrary
+from loopcal_native.library import BlockStructure, Strided, allocate, as_reals, locate
 from loopcal_native.library import TwistRows as StridedRows
 from loopcal_native.programs import require
 
@@ -64,3 +65,71 @@ def flatten_rows(observed: Sequence[TwistRows], t: int, n: int) -> FlatRows:
 def _join(arrays: Sequence[FloatArray], t: int) -> FloatArray:
     """Return the rows (t, M, ..) of all kinds behind each other."""
     return np.concatenate([np.broadcast_to(a, (t, *a.shape[1:])) for a in arrays], axis=1)
+
+
+class FlatBlocks(NamedTuple):
+    """Structures and rows of blocks as the library reads them; `kept` are their arrays, and
+    `solutions` as of `EliminatedBlocks`.
+    """
+
+    structures: Any
+    rows: Any
+    solutions: list[tuple[FloatArray, FloatArray]]
+    kept: list[np.ndarray]
+
+
+def describe_blocks(
+    structures: Sequence[Structure], rows: Sequence[BlockRows], shape: tuple[int, int, int]
+) -> FlatBlocks:
+    """Return blocks of t trials, U unknowns and q columns of the machine and the residual.
+
+    Raises
+    ------
+    ValueError : shapes differ, or something points beyond the unknowns, blocks and structures.
+    """
+    (t, U, q), listed, parts, kept = shape, [], [], list[np.ndarray]()
+    sizes = [(len(s), s.unknowns.shape[1], s.width) for s in structures]
+    solved = [((t, n, u, u), (t, n, u, w - u + q)) for n, u, w in sizes]
+    arrays = allocate(*((each, float) for pair in solved for each in pair))
+    solutions = list(zip(arrays[::2], arrays[1::2], strict=True))
+    for i, (s, (n, u, w)) in enumerate(zip(structures, sizes, strict=True)):
+        path, place = (np.ascontiguousarray(a, np.int64) for a in (s.path, s.parent_place))
+        require(path.shape == (n, w) and w >= u and _is_within(path, U), f"paths of {U} unknowns")
+        parents = sizes[s.parent] if 0 <= s.parent < i else (1, 0, 0)
+        is_right = s.parent < i and place.shape == (n,) and w == u + parents[2]
+        is_right = is_right and (s.parent < 0 or _is_within(place, parents[0]))
+        require(is_right, "a parent of each block before it")
+        addresses = (locate(a) for a in (path, place, *solutions[i]))
+        listed.append(BlockStructure(n, u, w, max(s.parent, -1), *addresses))
+        kept += [path, place]
+    for part in rows:
+        require(0 <= part.structure < len(sizes), f"{len(sizes)} structures")
+        n, _, w = sizes[part.structure]
+        place, columns = (np.ascontiguousarray(a, np.int64) for a in part[1:3])
+        require(part.machine.ndim == 4 and columns.ndim == 2, "rows (t, k, m, p + 1)")
+        (_, k, m, _), c = part.machine.shape, columns.shape[1]
+        shape = part.machine.shape
+        require(shape == (t, k, m, q), f"rows ({t}, k, m, {q}), not {shape}")
+        require(place.shape == (k,) and _is_within(place, n), f"places ({k},) of {n} blocks")
+        is_right = columns.shape == (k, c) and part.by_unknowns.shape == (t, k, m, c)
+        require(is_right and _is_within(columns, w + 1), f"columns ({k}, c) of {w}")
+        rows_of = [_collapse(a) for a in (part.by_unknowns, part.machine)]
+        strided = (Strided(a.ctypes.data, a.strides[0] // 8, a.strides[2] // 8) for a in rows_of)
+        parts.append(
+            RowsOfLibrary(part.structure, k, m, c, locate(place), locate(columns), *strided)
+        )
+        kept += [place, columns, *rows_of]
+    structures_of_library = (BlockStructure * len(listed))(*listed)
+    return FlatBlocks(structures_of_library, (RowsOfLibrary * len(parts))(*parts), solutions, kept)
+
+
+def _collapse(rows: FloatArray) -> FloatArray:
+    """Return rows (t, k, m, c) that are all as far apart in memory, a copy where they are not."""
+    _, step, between, number = rows.strides
+    is_even = number == 8 and step == rows.shape[2] * between and rows.dtype == np.float64
+    return rows if is_even else as_reals(rows)
+
+
+def _is_within(numbers: IntArray, count: int) -> bool:
+    """Return whether all numbers are from 0 to below a count."""
+    return not numbers.size or (int(numbers.min()) >= 0 and int(numbers.max()) < count)

@@ -54,6 +54,7 @@ from loopcal.numerics.elimination import (
     build_tree,
     eliminate_tree,
     spread_columns,
+    use_path,
 )
 from loopcal.numerics.statistics import compute_chi_square_tail, find_distinct
 from loopcal.typing import BoolArray, FloatArray, IntArray
@@ -137,14 +138,16 @@ class HeldOutBlocks(NamedTuple):
         k, factors = self.shared, NodeFactors(self.tree, 1, self.shared)
         for i, structure in enumerate(self.tree.structures):  # of variance 1
             n, u = structure.unknowns.shape
-            unit = np.eye(u, structure.width + k + 1)
-            factors.add(i, np.tile(unit, (n, 1))[None], np.repeat(np.arange(n), u))
+            unit, rest = np.eye(u, structure.width), np.zeros((1, n, u, k + 1))
+            rows = np.broadcast_to(unit, (1, n, *unit.shape))
+            factors.add(engine.BlockRows(i, np.arange(n), use_path(structure, n), rows, rest))
         factor = np.eye(k + 1)[None]
         factor[0, k, k] = 0.0
         for structure, numbers, nodes, rows, residual, _ in self.groups:
             kept = ~excluded[numbers]
             all_rows = np.concatenate([rows[kept], residual[kept][..., None]], axis=2)
-            part = NodeRows(structure, nodes[kept], numbers[kept], all_rows[None])
+            own = structure, nodes[kept], numbers[kept], all_rows[None]
+            part = NodeRows.divide(self.tree, *own)
             factor = fold_node_rows(factor, factors, [part] if kept.any() else [])
         done = None
         if self.tree.structures:

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from loopcal.typing import FloatArray, IntArray
+from loopcal.typing import BoolArray, FloatArray, IntArray
 
 PITCH, LENGTH = 6, 7
 """Values of `Slot.axis` beside the axes 0..5 of a twist."""
@@ -468,3 +468,61 @@ class TwistRows:
     poses: IntArray
     by_twist: FloatArray
     residual: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Structure:
+    """n nodes, blocks of unknowns, with as many of them, and as many columns in their paths, each.
+
+    unknowns : (n, u) the unknowns of each node.
+    path : (n, w) the unknowns of each node, followed by those of its ancestors, innermost first.
+    parent : number of the structure of the parents, -1 without any.
+    parent_place : (n,) place of each node's parent in that structure.
+    """
+
+    unknowns: IntArray
+    path: IntArray
+    parent: int
+    parent_place: IntArray
+
+    def __len__(self) -> int:
+        return len(self.unknowns)
+
+    @property
+    def width(self) -> int:
+        """Number w of columns of a path."""
+        return self.path.shape[1]
+
+
+class BlockRows(NamedTuple):
+    """Whitened rows of nodes of one structure: k sets, m rows each, of t trials.
+
+    structure : its number. places : (k,) node of each set in it. columns : (k, c) columns of the
+        node's path, w where a row has none.
+    by_unknowns : (t, k, m, c). machine : (t, k, m, p + 1), residuals last.
+    """
+
+    structure: int
+    places: IntArray
+    columns: IntArray
+    by_unknowns: FloatArray
+    machine: FloatArray
+
+
+class EliminatedBlocks(NamedTuple):
+    """What the elimination of all unknowns leaves, where it is regular.
+
+    factor : (t, p + 1, p + 1) upper triangular, of the rows left. values : (t, U, p + 1) best ones
+        by the machine's deviations, and here. length : (t, U) of the columns over all rows, 1 for
+        one of zeros. explained : (t,) decrease of the sum of squares by the best values.
+    is_regular : (t,) where the rows certainly determine all unknowns.
+    solutions : inverse and solution of the nodes of every structure, see `NodeSolution` of
+        `loopcal.numerics.elimination`.
+    """
+
+    factor: FloatArray
+    values: FloatArray
+    length: FloatArray
+    explained: FloatArray
+    is_regular: BoolArray
+    solutions: list[tuple[FloatArray, FloatArray]]

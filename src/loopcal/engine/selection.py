@@ -21,13 +21,16 @@ from numpy.typing import NDArray
 
 from loopcal.engine.program import (
     Advanced,
+    BlockRows,
     ClosureBlocks,
     ComparedPoses,
+    EliminatedBlocks,
     ParameterMap,
     Program,
     Reached,
     State,
     Steps,
+    Structure,
     Sums,
     Target,
     Task,
@@ -66,8 +69,8 @@ class Engine:
     """An implementation of the functions whose docstrings are below.
 
     name : as in LOOPCAL_ENGINE, with its variant. version : of the package that computes.
-    solve_triangles, compare_poses, follow, fold_compared : None where the functions of
-        `loopcal.numerics`, of `loopcal.geometry`, `solve` and `fold_poses` do it.
+    solve_triangles and those below : None where others do it, of the engine, of `loopcal.numerics`,
+        of `loopcal.geometry` or of kinds.
     """
 
     name: str
@@ -83,6 +86,8 @@ class Engine:
     compare_poses: Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]] | None = None
     follow: Callable[..., State] | None = None
     fold_compared: Callable[..., Advanced] | None = None
+    eliminate_blocks: Callable[..., EliminatedBlocks] | None = None
+    locate_points: Callable[..., tuple[FloatArray, FloatArray]] | None = None
 
     def __str__(self) -> str:
         return f"{self.name} {self.version}"
@@ -327,6 +332,25 @@ def fold_compared(
     return current.fold_compared(factor, program, e, q, start, inputs, measured, steps)
 
 
+def eliminate_blocks(
+    structures: Sequence[Structure],
+    rows: Sequence[BlockRows],
+    shape: tuple[int, int, int],
+    limit: float,
+) -> EliminatedBlocks | None:
+    """Eliminate all unknowns from whitened rows by orthogonal projection, innermost nodes first.
+
+    structures : of the nodes, parents before their children. rows : of all trials.
+    shape : t trials, U unknowns, those without a node among them, and p parameters.
+    limit : the singular values of the triangle of each node, in columns of length one over all
+        rows, must be above this share of the largest, 1 at least, to be regular.
+
+    None where the engine leaves this to `loopcal.numerics.elimination`.
+    """
+    own = get_current_engine().eliminate_blocks
+    return None if own is None else own(structures, rows, shape, limit)
+
+
 def solve_triangles(
     triangle: FloatArray, right: FloatArray
 ) -> tuple[FloatArray, FloatArray] | None:
@@ -357,6 +381,29 @@ def compare_poses(T: FloatArray, reference: FloatArray) -> tuple[FloatArray, Flo
     """
     compare = get_current_engine().compare_poses
     return None if compare is None else compare(T, reference)
+
+
+def locate_points(
+    T: FloatArray,
+    stated: FloatArray,
+    frame: FloatArray | None,
+    points: FloatArray,
+    columns: tuple[int, int, int],
+) -> tuple[FloatArray, FloatArray] | None:
+    """Return points of the platform in a frame, and their derivatives.
+
+    T : (t | 1, n | 1, 4, 4) [m]. points : (t | 1, n | 1, k, 3) on the platform.
+    stated : (4, 4) frame. frame : (t | 1, n | 1, 6) its rotation vector from there, and its place;
+        None as stated. columns : first ones of the frame's numbers and of the points, -1 for none,
+        and the number of columns.
+
+    Returns
+    -------
+    x : (t, n, k, 3). slopes : (t, n, k, 3, columns), by the twist of T, then by these numbers;
+        other columns are zero. None where the engine leaves this to `loopcal.measure.kinds`.
+    """
+    own = get_current_engine().locate_points
+    return None if own is None else own(T, stated, frame, points, columns)
 
 
 # --- Versions of what determines the last digits of a result.

@@ -18,6 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from loopcal import engine
+from loopcal.engine import BlockRows
 from loopcal.estimate.linearization import KindRows
 from loopcal.estimate.observation_rows import ObservationRows
 from loopcal.measure.nuisance import NuisanceParameters
@@ -28,7 +29,7 @@ from loopcal.numerics.elimination import (
     TreeElimination,
     build_tree,
     eliminate_tree,
-    spread_columns,
+    use_path,
 )
 from loopcal.numerics.statistics import find_distinct
 from loopcal.numerics.trial_batch import TrialBatch
@@ -55,14 +56,33 @@ class NodeRows(NamedTuple):
 
     structure : -1 for rows of the machine alone. nodes : (k,). numbers : (k,) what each of the k
         sets of rows belongs to: the row of a kind, or the component of poses.
-    rows : (a, k, m, w + p + 1). kind : number of the kind; -1 where they are of several.
+    by_unknowns : (a, k, m, c) at columns (k, c), see `BlockRows`. machine : (a, k, m, p + 1).
+    kind : number of the kind; -1 where they are of several.
     """
 
     structure: int
     nodes: IntArray
     numbers: IntArray
-    rows: FloatArray
+    by_unknowns: FloatArray
+    columns: IntArray
+    machine: FloatArray
     kind: int = -1
+
+    @classmethod
+    def divide(
+        cls,
+        tree: EliminationTree | None,
+        structure: int,
+        nodes: IntArray,
+        numbers: IntArray,
+        rows: FloatArray,
+    ) -> NodeRows:
+        """Return rows (a, k, m, w + p + 1) of several kinds, with columns of the whole path."""
+        w, columns = 0, np.zeros((len(nodes), 0), dtype=np.int64)
+        if tree is not None and structure >= 0:
+            columns = use_path(tree.structures[structure], len(nodes))
+            w = columns.shape[1]
+        return cls(structure, nodes, numbers, rows[..., :w], columns, rows[..., w:])
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,10 +156,10 @@ class NuisanceElimination:
                 continue
             unknown = structure.unknowns[place, column]
             tolerance = self.local.table.tolerance[unknown]
-            rows = np.zeros((len(values), len(place), structure.width + factors.parameters + 1))
-            rows[:, np.arange(len(place)), column] = 1.0 / tolerance
-            rows[:, :, -1] = off[:, unknown] / tolerance
-            factors.add(i, rows, place)
+            unit = np.broadcast_to(1.0 / tolerance[:, None, None], (len(values), len(place), 1, 1))
+            machine = np.zeros((len(values), len(place), 1, factors.parameters + 1))
+            machine[:, :, 0, -1] = off[:, unknown] / tolerance
+            factors.add(BlockRows(i, place, column[:, None], unit, machine))
 
     def eliminate(
         self, factors: NodeFactors, values: FloatArray
@@ -199,11 +219,9 @@ def list_members(
 
 
 def divide_among_nodes(
-    kinds: Sequence[KindRows | None],
-    members: Sequence[tuple[NodeMembers, ...]],
-    tree: EliminationTree | None,
+    kinds: Sequence[KindRows | None], members: Sequence[tuple[NodeMembers, ...]]
 ) -> list[NodeRows]:
-    """Return the rows of every kind by nodes, [nuisance | machine | residual].
+    """Return the rows of every kind by nodes.
 
     `members` are those of the kinds; none where the rows do not go to the nodes as they are.
     """
@@ -213,12 +231,12 @@ def divide_among_nodes(
             continue
         rows = kind.machine
         for structure, numbers, nodes, columns in of_kind:
-            chosen = rows if len(numbers) == rows.shape[1] else rows[:, numbers]
-            if structure >= 0 and kind.by_nuisance is not None and tree is not None:
-                width = tree.structures[structure].width
-                by_path = spread_columns(kind.by_nuisance[:, numbers], columns, width)
-                chosen = np.concatenate([by_path, chosen], axis=-1)
-            divided.append(NodeRows(structure, nodes, numbers, chosen, i))
+            is_all = len(numbers) == rows.shape[1]
+            chosen, own = rows if is_all else rows[:, numbers], rows[:, numbers, :, :0]
+            if structure >= 0 and kind.by_nuisance is not None:
+                own = kind.by_nuisance if is_all else kind.by_nuisance[:, numbers]
+            used = columns[:, : own.shape[3]]
+            divided.append(NodeRows(structure, nodes, numbers, own, used, chosen, i))
     return divided
 
 
@@ -226,25 +244,16 @@ def fold_node_rows(
     factor: FloatArray, factors: NodeFactors | None, node_rows: Sequence[NodeRows]
 ) -> FloatArray:
     """Fold rows into the factors of their nodes; return the machine's factor with its own rows."""
-    plain = [_flat(part) for part in node_rows if part.structure < 0]
+    of_machine = (part.machine for part in node_rows if part.structure < 0)
+    plain = [rows.reshape(len(rows), -1, rows.shape[-1]) for rows in of_machine]
     if plain:
         factor = engine.fold(factor, plain[0] if len(plain) == 1 else np.concatenate(plain, axis=1))
     if factors is None:
         return factor
-    for structure in sorted({part.structure for part in node_rows if part.structure >= 0}):
-        rows, places = [], []
-        for part in (part for part in node_rows if part.structure == structure):
-            places.append(np.repeat(factors.tree.place[part.nodes], part.rows.shape[2]))
-            rows.append(_flat(part))
-        together = rows[0] if len(rows) == 1 else np.concatenate(rows, axis=1)
-        factors.add(structure, together, np.concatenate(places))
+    for part in (part for part in node_rows if part.structure >= 0):
+        rows = part.columns, part.by_unknowns, part.machine
+        factors.add(BlockRows(part.structure, factors.tree.place[part.nodes], *rows))
     return factor
-
-
-def _flat(part: NodeRows) -> FloatArray:
-    """Return rows (a, k m, ..) of a part."""
-    a, k, m, w = part.rows.shape
-    return part.rows.reshape(a, k * m, w)
 
 
 def _sets(rows: Sequence[ObservationRows], member: IntArray | None) -> IntArray:

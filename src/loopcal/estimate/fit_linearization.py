@@ -287,8 +287,7 @@ def fold_sources(
     folded: dict[tuple[int, int], SourceFactor] = {}
     for block, linearized in poses.iterate_poses(solution, z):
         kinds = poses.linearize_kinds(block, linearized, problem.trials, fixed)
-        tree = None if poses.nuisance is None else poses.nuisance.tree
-        parts = divide_among_nodes(kinds, block.members, tree)
+        parts = divide_among_nodes(kinds, block.members)
         for source in range(count):
             own = [
                 _take_share(find_share(of, source, numbers), len(numbers), len(rows.poses))
@@ -297,7 +296,7 @@ def fold_sources(
             if not any(rows.any() for rows in own):
                 continue
             node_rows = _select_rows(poses, block, kinds, parts, own)
-            for part in spread_rows(poses, block, node_rows, p, at_nodes):
+            for part in spread_rows(poses, block, node_rows, at_nodes):
                 rows = part.rows[..., :-1]
                 for factor in divide_by_cluster(source, part.unknowns, rows, p, estimate):
                     key = source, int(factor.unknowns[0]) if len(factor.unknowns) else -1
@@ -349,14 +348,21 @@ def _select_rows(
         root = own[part.kind][part.numbers]
         kept = np.any(root, axis=(1, 2))
         if kept.any():
-            nodes, numbers = part.nodes[kept], part.numbers[kept]
-            rows = _weigh(part.rows[:, kept], root[kept])
-            chosen.append(part._replace(nodes=nodes, numbers=numbers, rows=rows))
+            taken = part._replace(
+                nodes=part.nodes[kept],
+                numbers=part.numbers[kept],
+                by_unknowns=_weigh(part.by_unknowns[:, kept], root[kept]),
+                columns=part.columns[kept],
+                machine=_weigh(part.machine[:, kept], root[kept]),
+            )
+            chosen.append(taken)
     k = poses.coordinates.count
     masked = [
         kind
         and KindRows(
-            _weigh(kind[0], root), *(a if a is None else _weigh(a, root) for a in kind[1:])
+            _weigh(kind.machine, root),
+            None if kind.by_nuisance is None else _weigh(kind.by_nuisance, root),
+            None if kind.by_coordinates is None else _weigh(kind.by_coordinates, root),
         )
         for kind, root in zip(kinds, own if block.groups else (), strict=False)
     ]
@@ -365,7 +371,8 @@ def _select_rows(
         width = group.poses.shape[1] * k
         solved = eliminate_columns(all_rows, width).solution
         left = own_rows[..., width:] - own_rows[..., :width] @ solved
-        chosen.append(NodeRows(group.structure, group.nodes, group.components, left))
+        of_group = tree, group.structure, group.nodes, group.components
+        chosen.append(NodeRows.divide(*of_group, left))
     return chosen
 
 

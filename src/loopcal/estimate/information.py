@@ -127,7 +127,6 @@ class FrameRows:
         elimination, whitened, trial = self._problem.nuisance, [], np.zeros(1, dtype=np.int64)
         by_frames = frame_twists(T, self._problem.free.robot.size)
         poses = LinearizedPoses(T, np.ones(T.shape[:2], dtype=bool), by_frames, joints)
-        tree = None if elimination is None else elimination.tree
         observed = [pair for pair in zip(kinds, evaluations, strict=True) if len(pair[0].poses)]
         for rows, evaluated in observed:
             kind = linearize_rows(rows, poses, trial, self._nuisance, evaluated=evaluated)
@@ -135,7 +134,7 @@ class FrameRows:
             self._effect = float(np.hypot(self._effect, length))
             whitened.append(kind)
         members = [list_members(elimination, rows) for rows, _ in observed]
-        node_rows = divide_among_nodes(whitened, members, tree)
+        node_rows = divide_among_nodes(whitened, members)
         self._factor = fold_node_rows(self._factor, self._factors, node_rows)
 
     def find_unfixed(self) -> UnfixedMotions | None:

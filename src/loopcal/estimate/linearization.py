@@ -273,11 +273,13 @@ class KindRows(NamedTuple):
     by_nuisance : (a, r, m, u) by the nuisance parameters that each row uses; None without any.
     by_coordinates : (a, r, links, m, k) by the coordinates of each linked pose; None where poses
         have none.
+    evaluated : what they were made of, if it is known.
     """
 
     machine: FloatArray
     by_nuisance: FloatArray | None
     by_coordinates: FloatArray | None
+    evaluated: Evaluation | None = None
 
     @property
     def residual(self) -> FloatArray:
@@ -351,6 +353,7 @@ def linearize_rows(
         by_coordinates=None
         if poses.by_coordinates is None
         else _coordinate_columns(rows, evaluated, white, poses, poses.by_coordinates),
+        evaluated=evaluated,
     )
 
 
@@ -485,6 +488,7 @@ class PoseSolution:
     states : (a, n) of the only block, for the next start; None as above.
     estimates : of uncertain poses; None where readings are exact.
     driven : joints of the only block; None where the next step has no use for them.
+    evaluated : rows of every kind at the poses of the only block, None for unknown ones.
     """
 
     nuisance: FloatArray | None
@@ -492,6 +496,7 @@ class PoseSolution:
     states: PoseStates | None = None
     estimates: PoseEstimates | None = None
     driven: DrivenJoints | None = None
+    evaluated: Sequence[Evaluation | None] | None = None
 
     @property
     def has_derivatives(self) -> bool:

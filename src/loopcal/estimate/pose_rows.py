@@ -22,7 +22,7 @@ poses that rows link, so that their coordinates are eliminated together.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from operator import itemgetter
 
@@ -52,6 +52,7 @@ from loopcal.estimate.linearization import (
 from loopcal.estimate.observation_rows import ObservationRows, consecutive_pairs
 from loopcal.estimate.pose_coordinates import PoseCoordinates
 from loopcal.findings import report_finding
+from loopcal.measure.kinds.kind import Evaluation
 from loopcal.mechanism.actuation import drive_joints
 from loopcal.mechanism.kinematics import WIDE, is_square
 from loopcal.mechanism.sensitivity import fold_pose_rows
@@ -81,6 +82,7 @@ class _Point:
     states: PoseStates | None
     nuisance: FloatArray | None
     linearized: list[LinearizedPoses]
+    evaluated: list[Evaluation | None] | None
     is_reached: BoolArray
     cost: FloatArray
     squares: FloatArray
@@ -209,14 +211,17 @@ class PoseRows:
                 is_converged=is_converged,
             )
             linearized = point.linearized[0] if self.is_kept else None
-            return PoseSolution(point.nuisance, linearized, point.states, estimates)
+            solved = point.nuisance, linearized, point.states, estimates
+            return PoseSolution(*solved, evaluated=point.evaluated)
         if known is None:
             known = self.solve_exact_poses(z, start, derivatives)
+        evaluated = None
         if solves_nuisance:
             located = [known.linearized] if known.linearized else self._locate_blocks(z)
             search = PoseSearch(self, z, trials, solves_nuisance, located)
-            nuisance = search.minimize(None, nuisance, control)[0].nuisance
-        return PoseSolution(nuisance, known.linearized, known.states, driven=known.driven)
+            point = search.minimize(None, nuisance, control)[0]
+            nuisance, evaluated = point.nuisance, point.evaluated
+        return replace(known, nuisance=nuisance, evaluated=evaluated)
 
     def solve_exact_poses(
         self, z: FloatArray, start: Start, derivatives: bool = True
@@ -275,11 +280,13 @@ class PoseRows:
         """
         tree = None if self.nuisance is None else self.nuisance.tree
         for block, poses in self.iterate_poses(solution, z):
-            kinds = self.linearize_kinds(block, poses, trials, solution.nuisance)
-            node_rows = divide_among_nodes(kinds, block.members, tree)
+            at = trials, solution.nuisance, True, solution.evaluated
+            kinds = self.linearize_kinds(block, poses, *at)
+            node_rows = divide_among_nodes(kinds, block.members)
             for group in block.groups:
                 rest = self.eliminate(block, group, kinds, self.nuisance)[0].rest
-                node_rows.append(NodeRows(group.structure, group.nodes, group.components, rest))
+                of_group = tree, group.structure, group.nodes, group.components
+                node_rows.append(NodeRows.divide(*of_group, rest))
             yield block, node_rows, poses.is_lost(block.is_needed)
 
     def fold_plain_rows(
@@ -340,17 +347,19 @@ class PoseRows:
         trials: IntArray,
         nuisance: FloatArray | None,
         by_parameters: bool = True,
+        evaluated: Sequence[Evaluation | None] | None = None,
     ) -> list[KindRows | None]:
         """Return the whitened rows of every kind at a block's poses; None without any.
 
         Without derivatives by the parameters, rows that nothing else changes are left out.
+        `evaluated` are their residuals and derivatives, where they are known already.
         """
         return [
-            linearize_rows(rows, poses, trials, nuisance, by_parameters)
+            linearize_rows(rows, poses, trials, nuisance, by_parameters, known)
             if len(rows.poses)
             and (by_parameters or self.coordinates.count or rows.nuisance.shape[1])
             else None
-            for rows in block.rows
+            for rows, known in zip(block.rows, evaluated or [None] * len(block.rows), strict=True)
         ]
 
     def count_rows(self, block_of_pose: IntArray, count: int) -> IntArray:
@@ -488,7 +497,7 @@ class PoseSearch:
         squares, gain, cost = np.zeros((a, components)), np.zeros(a), np.zeros(a)
         rank = np.zeros((a, components), dtype=np.int64)
         is_unobservable = np.zeros((a, n, k), dtype=bool)
-        linearized, solutions, closed = [], [], []
+        linearized, solutions, closed, kinds = [], [], [], list[KindRows | None]()
         is_reached, is_lost = np.zeros((a, n), dtype=bool), np.zeros(a, dtype=bool)
         for i, block in enumerate(pose_rows.blocks):
             if self.located is None:
@@ -508,9 +517,9 @@ class PoseSearch:
             is_lost |= poses.is_lost(block.is_needed)
             linearized = [poses] if pose_rows.is_kept else []
             kinds = pose_rows.linearize_kinds(block, poses, self.trials, nuisance, False)
-            node_rows = divide_among_nodes(kinds, block.members, tree)
+            node_rows = divide_among_nodes(kinds, block.members)
             node_rows = [part for part in node_rows if part.structure >= 0]
-            cost += sum((part.rows[..., -1] ** 2).sum(axis=(1, 2)) for part in node_rows)
+            cost += sum((part.machine[..., -1] ** 2).sum(axis=(1, 2)) for part in node_rows)
             for group in block.groups:
                 best, before = pose_rows.eliminate(block, group, kinds, self.nuisance)
                 squares[:, group.components] = before
@@ -521,8 +530,8 @@ class PoseSearch:
                 is_unobservable[:, numbers] = part.reshape(a, *group.poses.shape, k)
                 solutions.append((numbers, group, best.solution))
                 if group.structure >= 0:
-                    own = group.structure, group.nodes, group.components, best.rest
-                    node_rows.append(NodeRows(*own))
+                    own = tree, group.structure, group.nodes, group.components, best.rest
+                    node_rows.append(NodeRows.divide(*own))
             if factors is not None:
                 fold_node_rows(empty_factor(0, 0), factors, node_rows)
         cost = cost + squares.sum(axis=1)
@@ -534,6 +543,7 @@ class PoseSearch:
             states=PoseStates.join_poses(closed, pose_rows.pose_order) if closed else None,
             nuisance=nuisance,
             linearized=linearized,
+            evaluated=[k and k.evaluated for k in kinds] if pose_rows.is_kept else None,
             is_reached=is_reached,
             cost=np.where(is_lost | ~np.isfinite(cost), np.inf, cost),
             squares=squares,
@@ -553,8 +563,8 @@ class PoseSearch:
         rows, a, nuisance, change = self.rows, len(self.values), None, point.gain
         u = np.zeros((a, len(rows.member), rows.coordinates.count))
         if point.factors is not None:
-            nuisance = eliminate_tree(point.factors)[0].shift
-            change = change + point.factors.squared_change(nuisance)
+            done, _ = eliminate_tree(point.factors)
+            nuisance, change = done.shift, change + done.explained
         for numbers, group, solution in point.solutions:
             right = np.ones((a, len(numbers), 1))
             if nuisance is not None and self.nuisance is not None and group.structure >= 0:

@@ -63,7 +63,7 @@ from loopcal.measure.observations import compute_whitener
 from loopcal.measure.readings import list_sensed_joints, make_readings_kind, resolve_reading_sigma
 from loopcal.mechanism.model import Mechanism
 from loopcal.numerics.decomposition import RANK_TOLERANCE, are_nonzero, empty_factor
-from loopcal.numerics.elimination import NodeFactors
+from loopcal.numerics.elimination import NodeFactors, spread_columns
 from loopcal.numerics.gauss_newton import Halving
 from loopcal.numerics.trial_batch import select_counts
 from loopcal.typing import BoolArray, FloatArray, IntArray
@@ -81,11 +81,7 @@ AtNodes = Callable[[IntArray], tuple[IntArray, FloatArray, FloatArray]]
 
 
 def spread_rows(
-    poses: PoseRows,
-    block: PoseBlock,
-    node_rows: Iterable[NodeRows],
-    p: int,
-    at_nodes: AtNodes | None,
+    poses: PoseRows, block: PoseBlock, node_rows: Iterable[NodeRows], at_nodes: AtNodes | None
 ) -> Iterator[LeverageRows]:
     """Give rows with columns for the nuisance parameters that they move, poses eliminated (one
     trial).
@@ -94,10 +90,11 @@ def spread_rows(
     `at_nodes` is None without nuisance parameters.
     """
     for part in node_rows:
-        rows, path = part.rows[0], np.zeros((len(part.nodes), 0), dtype=np.int64)
+        rows, path = part.machine[0], np.zeros((len(part.nodes), 0), dtype=np.int64)
         if at_nodes is not None and part.structure >= 0:
             path, root, slope = at_nodes(part.nodes)
-            moved, rows = rows[..., : -p - 1], rows[..., -p - 1 :].copy()
+            moved = spread_columns(part.by_unknowns[0], part.columns, path.shape[1])
+            rows = rows.copy()
             rows[..., :-1] += moved @ slope
             rows = np.concatenate([moved @ root, rows], axis=2)
         first, numbers, columns = poses.first_pose, part.numbers, np.zeros((0, 0), dtype=np.int64)
@@ -359,7 +356,7 @@ class Problem:
             return linearization
         # directions that the rows do not determine at poses without residuals
         states = self.consistent.move(solution, deviation, self.trials, start)
-        moved = replace(solution, states=states, linearized=None)
+        moved = replace(solution, states=states, linearized=None, evaluated=None)
         reference = self._eliminate(moved, deviation, start).factor
         return replace(linearization, factor=remove_null_space(linearization.factor, reference))
 
@@ -445,7 +442,7 @@ class Problem:
         of_base = {i for i, r in enumerate(self.rows) if r.kind.is_of_base}
         for block, node_rows, _ in self.poses.iterate_rows(solution, z, self.trials):
             of_poses = [part for part in node_rows if part.kind not in of_base]
-            yield list(spread_rows(self.poses, block, of_poses, self.parameters, at_nodes))
+            yield list(spread_rows(self.poses, block, of_poses, at_nodes))
 
     def count_pose_directions(
         self, solution: PoseSolution, member: IntArray, count: int

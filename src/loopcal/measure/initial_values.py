@@ -32,6 +32,8 @@ from loopcal.typing import BoolArray, FloatArray, IntArray
 # Sum of squares, in variances of the noise, by which one solution fits better than another without
 # being told from it: one standard deviation.
 ALIKE = 1.0
+# Ratio of sums of squares above which rounding and curvature cannot change which one is lower.
+AS_LOW = 4.0
 # Rows of a group, and values for each of its unknowns, from which start values are sought: more
 # would make them no better, since the geometry of the robot is not known yet.
 FEWEST_ROWS, VALUES = 60, 20.0
@@ -372,8 +374,14 @@ def _refine_candidates(
         cost = sum_squares(whiten(candidates, sets)[0]).reshape(t * g, k)
         chosen = (np.argsort(cost, axis=1)[:, :most] + k * np.arange(t * g)[:, None]).ravel()
         candidates, sets, k = candidates[chosen], sets[chosen], most
+    worth = np.inf
+    if kind.guesses_minima and not kind.shared_errors and not kept.any():
+        # minima for equal noise: each is left where another one is lower for any other noise, too
+        size = np.abs(np.einsum("...mm->...m", whitener))
+        if np.count_nonzero(size) == np.count_nonzero(whitener):
+            worth = AS_LOW * (size.max() / size.min(where=size > 0.0, initial=np.inf)) ** 2
     refined, cost = minimize_from_starts(
-        lambda x, which: whiten(x, sets[which]), candidates, steps, GOOD_START
+        lambda x, which: whiten(x, sets[which]), candidates, steps, GOOD_START, sets, worth
     )
     names = [parameter.name for parameter in kind.nuisance_parameters]
     shortest = shorten_rotations(names, refined)

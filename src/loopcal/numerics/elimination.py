@@ -21,7 +21,13 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 
 from loopcal import engine
-from loopcal.numerics.decomposition import NUISANCE_TOLERANCE, NULL_COMPONENT, empty_factor
+from loopcal.engine import BlockRows, Structure
+from loopcal.numerics.decomposition import (
+    NUISANCE_TOLERANCE,
+    NULL_COMPONENT,
+    certain_share,
+    empty_factor,
+)
 from loopcal.numerics.statistics import find_distinct
 from loopcal.numerics.trial_batch import TrialBatch
 from loopcal.typing import BoolArray, FloatArray, IntArray
@@ -31,30 +37,6 @@ from loopcal.typing import BoolArray, FloatArray, IntArray
 TARGET = "target"
 # Scopes of unknowns, from the outermost to the innermost.
 SCOPES = ("machine", "session", "group", "pose", TARGET)
-
-
-@dataclass(frozen=True, eq=False)
-class Structure:
-    """n nodes with as many unknowns, and as many columns in their paths, each.
-
-    unknowns : (n, u) the unknowns of each node.
-    path : (n, w) the unknowns of each node, followed by those of its ancestors, innermost first.
-    parent : number of the structure of the parents, -1 without any.
-    parent_place : (n,) place of each node's parent in that structure.
-    """
-
-    unknowns: IntArray
-    path: IntArray
-    parent: int
-    parent_place: IntArray
-
-    def __len__(self) -> int:
-        return len(self.unknowns)
-
-    @property
-    def width(self) -> int:
-        """Number w of columns of a path."""
-        return self.path.shape[1]
 
 
 @dataclass(frozen=True, eq=False)
@@ -243,56 +225,61 @@ def _sort_by_structure(node: IntArray, parent: IntArray, cluster: IntArray) -> E
 SHORTEST_DIRECTION = 0.5
 
 
+def use_path(structure: Structure, count: int) -> IntArray:
+    """Return the columns (count, w) of rows that use the whole path of their node."""
+    return np.broadcast_to(np.arange(structure.width), (count, structure.width))
+
+
+def fill_rows(rows: BlockRows, tree: EliminationTree) -> FloatArray:
+    """Return rows (a, k m, w + p + 1), with all columns of the paths of their nodes."""
+    width = tree.structures[rows.structure].width
+    own = spread_columns(rows.by_unknowns, rows.columns, width)
+    whole = np.concatenate([own, rows.machine], axis=-1)
+    return whole.reshape(len(whole), -1, whole.shape[-1])
+
+
 class NodeFactors:
-    """The triangular factors of all nodes: working memory while rows are folded.
+    """The rows of all nodes, folded into triangular factors where they are many: working memory.
 
     tree : of the U unknowns. trials : a. parameters : p of the machine.
     """
 
-    tree: EliminationTree
-    trials: int
-    parameters: int
-
     def __init__(self, tree: EliminationTree, trials: int, parameters: int) -> None:
         self.tree, self.trials, self.parameters = tree, trials, parameters
-        self._factors: list[FloatArray | None] = [None] * len(tree.structures)
-        self._heights = [0] * len(tree.structures)
+        self._factors: list[FloatArray] = [
+            np.zeros((trials, len(s), 0, s.width + parameters + 1)) for s in tree.structures
+        ]
+        self._rows: list[BlockRows] = []
 
-    def add(self, structure: int, rows: FloatArray, places: IntArray) -> None:
-        """Fold rows (a, k, w + p + 1) into the nodes at `places` (k,) of one structure."""
-        factor, used = self._factors[structure], self._heights[structure]
-        if factor is None:
-            count = len(self.tree.structures[structure])
-            factor = np.zeros((self.trials, count, 0, rows.shape[-1]))
-        height = _folded_height(factor, used, places)
-        if height > factor.shape[2]:
-            factor = _with_height(factor, height)
-        _fold_in_place(factor, used, rows, places)
-        self._factors[structure], self._heights[structure] = factor, max(height, used)
+    def add(self, rows: BlockRows) -> None:
+        """Add rows of nodes."""
+        self._rows.append(rows)
+        if sum(part.machine.size + part.by_unknowns.size for part in self._rows) > KEPT:
+            self._fold()
+
+    def _fold(self) -> None:
+        """Fold all rows into the factors."""
+        for structure in sorted({part.structure for part in self._rows}):
+            own = [part for part in self._rows if part.structure == structure]
+            rows = np.concatenate([fill_rows(part, self.tree) for part in own], axis=1)
+            places = np.concatenate([p.places.repeat(p.machine.shape[2]) for p in own])
+            self._factors[structure] = fold_at(self._factors[structure], rows, places)
+        self._rows = []
 
     def arrays(self) -> list[FloatArray]:
         """Return the factors (a, n, h, w + p + 1) of every structure; h = 0 without rows."""
-        p = self.parameters + 1
-        pairs = zip(self._factors, self.tree.structures, strict=True)
-        return [
-            np.zeros((self.trials, len(s), 0, s.width + p)) if f is None else f for f, s in pairs
+        self._fold()
+        return list(self._factors)
+
+    def list_rows(self) -> list[BlockRows]:
+        """Return all rows, those of the factors first."""
+        pairs = enumerate(zip(self._factors, self.tree.structures, strict=True))
+        folded = [
+            BlockRows(i, np.arange(len(s)), use_path(s, len(s)), *np.split(f, [s.width], axis=-1))
+            for i, (f, s) in pairs
+            if f.shape[2]
         ]
-
-    def sum_of_squares(self) -> FloatArray:
-        """Return the sum of squares (a,) of the right-hand sides; infinite if not finite."""
-        total = np.zeros(self.trials)
-        for factor in self.arrays():
-            total = total + (factor[..., -1] ** 2).sum(axis=(1, 2))
-        return np.where(np.isfinite(total), total, np.inf)
-
-    def squared_change(self, step: FloatArray) -> FloatArray:
-        """Return the squared length (a,) of the change of all rows by a step (a, U)."""
-        total = np.zeros(self.trials)
-        for factor, structure in zip(self.arrays(), self.tree.structures, strict=True):
-            columns = factor[..., : structure.width]
-            change = np.matmul(columns, step[:, structure.path][..., None])
-            total += (change**2).sum(axis=(1, 2, 3))
-        return total
+        return folded + self._rows
 
 
 class UnknownRoot(NamedTuple):
@@ -364,6 +351,7 @@ class TreeElimination(TrialBatch):
     slope : (a, U, p) change of the best values by the machine's deviations.
     shift : (a, U) step from the present values to the best ones at the present machine.
     rank : (a,) number of observable directions.
+    explained : (a,) decrease of the sum of squares by the shift.
     is_unobservable : (a, U) unknowns with a part in an unobservable direction.
     nodes : the solution of every structure. length : (a, U) of the columns over all rows.
     """
@@ -374,6 +362,7 @@ class TreeElimination(TrialBatch):
     slope: FloatArray
     shift: FloatArray
     rank: IntArray
+    explained: FloatArray
     is_unobservable: BoolArray
     nodes: tuple[NodeSolution, ...]
     length: FloatArray
@@ -469,16 +458,49 @@ class TreeElimination(TrialBatch):
 
 def eliminate_tree(factors: NodeFactors) -> tuple[TreeElimination, FloatArray]:
     """Eliminate all unknowns; return also the factor (a, p + 1, p + 1) of the rows left."""
+    tree, limit = factors.tree, certain_share(NUISANCE_TOLERANCE)
+    done = None
+    if tree.structures:
+        shape = factors.trials, len(tree.node), factors.parameters
+        done = engine.eliminate_blocks(tree.structures, factors.list_rows(), shape, limit)
+    if done is None:
+        return _eliminate_by_decompositions(factors)
+    nodes = tuple(
+        NodeSolution(inverse, solution, np.zeros_like(inverse))
+        for inverse, solution in done.solutions
+    )
+    values, length = done.values, done.length
+    elimination = TreeElimination(
+        tree,
+        values[..., :-1],
+        values[..., -1],
+        np.full(factors.trials, (tree.node >= 0).sum()),
+        done.explained,
+        np.zeros(length.shape, dtype=bool),
+        nodes,
+        length,
+    )
+    if done.is_regular.all():
+        return elimination, done.factor
+    whole, rest = _eliminate_by_decompositions(factors)
+    good = np.flatnonzero(done.is_regular)
+    rest[good] = done.factor[good]
+    return whole.put(good, elimination.take(good)), rest
+
+
+def _eliminate_by_decompositions(factors: NodeFactors) -> tuple[TreeElimination, FloatArray]:
+    """Return `eliminate_tree` where rows may leave directions of the unknowns open."""
     tree, arrays = factors.tree, factors.arrays()
     length = _column_lengths(factors, arrays)
     rest = empty_factor(factors.trials, factors.parameters)
-    rank = np.zeros(factors.trials, dtype=np.int64)
+    rank, explained = np.zeros(factors.trials, dtype=np.int64), np.zeros(factors.trials)
     solutions: list[NodeSolution] = []
     for i in reversed(range(len(tree.structures))):
         structure = tree.structures[i]
         done = _eliminate_nodes(arrays[i], length[:, structure.unknowns], structure)
         solutions.append(NodeSolution(done.inverse, done.solution, done.unobservable))
         rank += done.rank.sum(axis=1)
+        explained += done.explained.sum(axis=1)
         u = structure.unknowns.shape[1]
         left = done.rest[..., u:, :] if done.is_observable.all() else done.rest
         rows = left.reshape(factors.trials, -1, left.shape[-1])
@@ -490,9 +512,8 @@ def eliminate_tree(factors: NodeFactors) -> tuple[TreeElimination, FloatArray]:
     nodes = tuple(reversed(solutions))
     values = _back_substitute(factors, nodes)
     is_unobservable, values = _remove_unobservable(tree, nodes, length, values)
-    elimination = TreeElimination(
-        tree, values[..., :-1], values[..., -1], rank, is_unobservable, nodes, length
-    )
+    best = tree, values[..., :-1], values[..., -1], rank, explained
+    elimination = TreeElimination(*best, is_unobservable, nodes, length)
     return elimination, rest
 
 
@@ -586,50 +607,22 @@ def _carry_inwards(
     return carried, clusters
 
 
-# Numbers that are decomposed together, about: more of them take memory and save no time.
-FOLDED = 2_000_000
+# Numbers of rows that are kept, about, before they are folded.
+KEPT = 4_000_000
 
 
 def fold_at(factor: FloatArray, rows: FloatArray, places: IntArray) -> FloatArray:
     """Return factors (a, n, h, w) with rows (a, k, w) folded in at places (k,)."""
-    used = factor.shape[2]
-    out = _with_height(factor, max(used, _folded_height(factor, used, places)))
-    _fold_in_place(out, used, rows, places)
+    used, w = factor.shape[2:]
+    order = np.argsort(places, kind="stable")
+    parts = np.split(order, np.flatnonzero(np.diff(places[order])) + 1) if len(order) else []
+    out = _with_height(factor, min(w, used + max(map(len, parts), default=0)))
+    for own in parts:
+        node = places[own[0]]
+        whole = np.hstack([factor[:, node], rows[:, own]])
+        triangle = np.asarray(np.linalg.qr(whole, mode="r"))
+        out[:, node, : triangle.shape[1]] = triangle
     return out
-
-
-def shorten_rows(rows: FloatArray, width: int) -> FloatArray:
-    """Return fewer rows (a, k, w) of the same triangular factor as rows (a, M, w), where they use
-    few of the first `width` columns, such as those of one of many targets; rows that use the same
-    columns are folded by these alone. The rows as they are where this would not halve the work.
-    """
-    a, M, w = rows.shape
-    is_used: BoolArray = np.asarray(np.any(rows[..., :width], axis=0))
-    if not is_used.size:
-        return rows
-    key = is_used @ np.random.default_rng(0).integers(1, 2**40, width)
-    group = np.unique(key, return_inverse=True)[1]
-    order, g = np.argsort(group, kind="stable"), int(group.max()) + 1
-    starts = np.searchsorted(group[order], np.arange(g))
-    used = np.logical_or.reduceat(is_used[order], starts)
-    narrow = int(used.sum(axis=1).max(initial=0)) + w - width
-    if 2 * (M * narrow**2 + g * narrow * w**2) > M * w**2:
-        return rows
-    # the columns of each group, the first unused ones in place of missing ones, then the others
-    columns = np.argsort(~used, axis=1, kind="stable")[:, : narrow - w + width]
-    columns = np.concatenate([columns, np.tile(np.arange(width, w), (g, 1))], axis=1)
-    own = np.take_along_axis(rows, columns[group][None], axis=2)
-    triangles = fold_at(np.zeros((a, g, 0, narrow)), own, group)
-    spread = np.zeros((a, g, triangles.shape[2], w))
-    np.put_along_axis(
-        spread, np.broadcast_to(columns[None, :, None], triangles.shape), triangles, 3
-    )
-    return spread.reshape(a, -1, w)
-
-
-def _folded_height(factor: FloatArray, used: int, places: IntArray) -> int:
-    """Return the rows of factors after one more fold, of which `used` are in use before."""
-    return min(factor.shape[3], used + int(np.bincount(places, minlength=1).max()))
 
 
 def _with_height(factor: FloatArray, height: int) -> FloatArray:
@@ -637,39 +630,6 @@ def _with_height(factor: FloatArray, height: int) -> FloatArray:
     out = np.zeros((*factor.shape[:2], height, factor.shape[3]))
     out[:, :, : factor.shape[2]] = factor
     return out
-
-
-def _fold_in_place(out: FloatArray, used: int, rows: FloatArray, places: IntArray) -> None:
-    """Fold rows (a, k, w) into factors (a, n, height, w) at places (k,).
-
-    The first `used` rows of the factors are in use. Factors that get about as many rows are worked
-    on together, padded with rows of zeros. The others are not touched.
-    """
-    a, n, _, w = out.shape
-    count = np.bincount(places, minlength=n)
-    order = np.argsort(places, kind="stable")
-    within = np.empty(len(places), dtype=np.int64)
-    within[order] = np.arange(len(places)) - np.repeat(np.cumsum(count) - count, count)
-    size = np.where(count > 0, np.ceil(np.log2(np.maximum(count, 1))), -1)
-    for alike in find_distinct(size[size >= 0]):
-        nodes = np.flatnonzero(size == alike)
-        height = used + int(count[nodes].max())
-        parts = min(len(nodes), -(-len(nodes) * height * w * a // FOLDED))
-        for chosen in np.array_split(nodes, parts):
-            index = np.full(n, -1)
-            index[chosen] = np.arange(len(chosen))
-            mine = np.flatnonzero(index[places] >= 0)
-            stacked = np.zeros((a, len(chosen), height - used, w))
-            stacked[:, index[places[mine]], within[mine]] = rows[:, mine]
-            if height < w:  # fewer rows than columns: no others may come from rounding
-                whole = np.concatenate([out[:, chosen, :used], stacked], axis=2)
-                triangle = np.asarray(np.linalg.qr(whole, mode="r"))
-            else:
-                begun = np.zeros((a, len(chosen), w, w))
-                begun[:, :, :used] = out[:, chosen, :used]
-                flat = (each.reshape(a * len(chosen), -1, w) for each in (begun, stacked))
-                triangle = engine.fold(*flat).reshape(begun.shape)
-            out[:, chosen, : triangle.shape[2]] = triangle
 
 
 # Derivatives that are nothing but rounding.
@@ -686,9 +646,8 @@ def without_rounding(values: FloatArray, size: FloatArray) -> FloatArray:
     A column that is rounding must be set to zero BEFORE columns are scaled to length one: after
     that, a few units of the last place look like any other direction and produce an unbounded step.
     """
-    return np.where(
-        (np.abs(values) <= ROUNDING * size) & (size > 0.0) & (size < np.inf), 0.0, values
-    )
+    limit = np.where((size > 0.0) & (size < np.inf), ROUNDING * size, -1.0)
+    return np.where(np.abs(values) <= limit, 0.0, values)
 
 
 # Elimination of leading columns of stacked rows by orthogonal projection.

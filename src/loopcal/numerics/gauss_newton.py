@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from loopcal.numerics.elimination import shorten_rows
+from loopcal import engine
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
 # Relative change of a sum of squares that is rounding and says nothing about a step.
@@ -134,18 +134,28 @@ standard deviation or of order one, and their Jacobians (c, M, u)."""
 
 
 def minimize_from_starts(
-    linearize: Linearize, x: FloatArray, steps: int = STEPS, negligible: float = NEGLIGIBLE_STEP
+    linearize: Linearize,
+    x: FloatArray,
+    steps: int = STEPS,
+    negligible: float = NEGLIGIBLE_STEP,
+    rivals: IntArray | None = None,
+    worth: float = np.inf,
 ) -> tuple[FloatArray, FloatArray]:
     """Minimize sums of squares from starts x (c, u) at once, by damped Gauss-Newton; return the
     ends and the sums of squares (c,), infinite where a start cannot be evaluated.
 
     A start ends where a step moves the residuals by a `negligible` share of their sigma, or of
-    themselves.
+    themselves; and at once where its sum of squares is more than `worth` times the lowest one of
+    its `rivals`, the starts with the same number (c,).
     """
     x = np.array(x)
     residual, jacobian = map(np.array, linearize(x, np.arange(len(x))))
     cost, damping = sum_squares(residual), np.full(len(x), FIRST_DAMPING)
     active = np.flatnonzero(np.isfinite(cost))
+    if rivals is not None and worth < np.inf:
+        lowest = np.full(int(rivals.max()) + 1, np.inf)
+        np.minimum.at(lowest, rivals, cost)
+        active = active[cost[active] <= worth * lowest[rivals[active]]]
     for _ in range(steps):
         if not active.size:
             break
@@ -183,8 +193,8 @@ def _damp_step(
     stack = np.concatenate([columns, residual[..., None]], axis=-1)
     if not np.isfinite(stack.sum()):  # else no entry is infinite or NaN
         stack = np.nan_to_num(stack)
-    shorter = shorten_rows(stack, jacobian.shape[2])
-    R = np.asarray(np.linalg.qr(shorter, mode="r"), dtype=float)
+    (c, _, w) = stack.shape
+    R = engine.fold(np.zeros((c, w, w)), stack)
     U, s, V = np.linalg.svd(R[..., :-1], full_matrices=False)
     right = np.einsum("cmk,cm->ck", U, R[..., -1])
     total = s * s + damping[:, None] ** 2 + SMALLEST**2

@@ -12,6 +12,7 @@ import numpy as np
 from loopcal.engine import select_engine
 from tests.engine.cases import draw_map, make_case, make_pose_rows
 from tests import zoo
+from tests.engine.native.test_blocks import draw_rows
 from loopcal.engine import Target
 from loopcal.io.robot.robot_file import load_robot
 
@@ -26,6 +27,8 @@ rods = make_case(load_robot("hexapod-42"), n=3)
 target = Target(rods.q, (0, 1, -1, 3, 4, 5), False, rods.home.T[0, 0])
 reached = engine.solve(rods.program, rods.e, rods.q, rods.home)
 T, reference = np.tile(np.eye(4), (9, 3, 1, 1)), np.ones((9, 3, 12))
+blocks = draw_rows(1)
+unknowns = 1, len(blocks.tree.node), 5
 triangle, right = np.tile(np.eye(9), (9, 1, 1)), np.ones((9, 9))
 
 def call(times):
@@ -38,6 +41,8 @@ def call(times):
         engine.certify(rods.program, rods.e, rods.home, reached)
         engine.compare_poses(T, reference)
         engine.solve_triangles(triangle, right)
+        engine.locate_points(T, T[0, 0], None, np.ones((1, 1, 2, 3)), (-1, 6, 12))
+        engine.eliminate_blocks(blocks.tree.structures, blocks.list_rows(), unknowns, 1e-10)
         engine.reach(rods.program, rods.e, target, rods.home)
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 

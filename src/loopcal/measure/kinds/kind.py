@@ -33,7 +33,7 @@ from loopcal.errors import DataError
 from loopcal.measure.array_checks import set_fields
 from loopcal.measure.kinds.setup_parameters import SetupItem, encode_frame
 from loopcal.mechanism.limb_rows import name_entries
-from loopcal.numerics.elimination import spread_columns, without_rounding
+from loopcal.numerics.elimination import without_rounding
 from loopcal.numerics.statistics import find_distinct
 from loopcal.parameters import Parameter
 from loopcal.plain_text import represent
@@ -516,6 +516,13 @@ class Kind(ABC):
         """
         return self.nominal_values[None]
 
+    @property
+    def guesses_minima(self) -> bool:
+        """Whether the candidates of `guess_values` are the lowest minima of the sum of squares, for
+        residuals of equal noise.
+        """
+        return False
+
     def guess_sets(
         self, T: FloatArray, measured: FloatArray, is_row: BoolArray
     ) -> list[FloatArray | DataError]:
@@ -581,8 +588,6 @@ class Kind(ABC):
         if not isinstance(measured, MeasuredColumns):
             measured = self.prepare_columns(measured)
         values = self.nominal_values[None, None] if nuisance is None else nuisance
-        if self.divided is not None:
-            return self._join_targets(*self.divided, T, measured, values, joints)
         T = self._find_platform(T, joints)
         if len(values) > len(T):
             T = np.broadcast_to(T, (len(values), *T.shape[1:]))
@@ -591,12 +596,9 @@ class Kind(ABC):
             # Derivatives by the place of a target cancel between parallel poses: what is rounding
             # beside the derivative by the twist is zero. Radians count as moves of the largest
             # distance from the base, whatever the size of a machine.
-            by_angle, by_length = (
-                np.linalg.norm(part, axis=-1) for part in np.split(result.jacobian, 2, axis=-1)
-            )
-            reach = np.abs(T[..., :3, 3]).max(initial=0.0)
-            reach = np.where(reach > 0.0, reach, 1.0)
-            by_move = np.hypot(by_angle / reach, by_length)
+            reach = float(np.abs(T[..., :3, 3]).max(initial=0.0))
+            reach = reach if reach > 0.0 else 1.0
+            by_move = np.sqrt(result.jacobian**2 @ np.repeat([reach**-2, 1.0], 3))
             by_move = by_move.sum(axis=-2) if self.poses_per_row > 1 else by_move
             size = by_move[..., None] * np.where(np.array(self._is_length), 1.0, reach)
             result = result._replace(nuisance=without_rounding(result.nuisance, size))
@@ -618,41 +620,6 @@ class Kind(ABC):
         residual = np.where(measured.present, result.residual, 0.0)
         jacobian = np.where(by_twist, result.jacobian, 0.0)
         return Evaluation(residual, jacobian, by_nuisance, by_joints)
-
-    def _join_targets(
-        self,
-        kind: Kind,
-        places: IntArray,
-        T: FloatArray,
-        measured: MeasuredColumns,
-        values: FloatArray,
-        joints: FloatArray,
-    ) -> Evaluation:
-        """Return `evaluate` from rows of one target each, of a kind and with parameters at places
-        (k, u') of all: work on no derivative that is zero.
-        """
-        k, (t, r, c) = len(places), measured.columns.shape
-        columns = measured.columns.reshape(t, r * k, c // k)
-        present = measured.present.reshape(len(measured.present), r * k, c // k)
-        reference = kind._compute_reference(columns)
-        own = values[..., places]
-        own = np.broadcast_to(own, (len(own), r, *own.shape[2:]))
-        own = own.reshape(len(own), r * k, own.shape[-1])
-        T, joints = (
-            x.repeat(k if x.shape[1] > 1 or r == 1 else r * k, axis=1) for x in (T, joints)
-        )
-        each = MeasuredColumns(columns, reference, present, measured.is_complete)
-        residual, jacobian, by_own, by_joints = kind.evaluate(T, each, own, joints)
-        assert by_own is not None
-        (t, _, m), links, u = residual.shape, jacobian.shape[2:-2], values.shape[-1]
-        by_pose = np.moveaxis(jacobian.reshape(t, r, k, *links, m, 6), 2, -3)
-        by_setup = spread_columns(by_own, np.tile(places, (r, 1)), u)
-        return Evaluation(
-            residual.reshape(t, r, k * m),
-            by_pose.reshape(t, r, *links, k * m, 6),
-            by_setup.reshape(len(by_own), r, k * m, u),
-            None if by_joints is None else by_joints.reshape(t, r, k * m, by_joints.shape[-1]),
-        )
 
     def _find_platform(self, T: FloatArray, joints: FloatArray) -> FloatArray:
         """Return the measured bodies (.., 4, 4): end platforms T, those of a stage, or the base."""

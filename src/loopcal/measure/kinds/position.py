@@ -15,13 +15,14 @@ from typing import ClassVar, Self
 
 import numpy as np
 
-from loopcal import geometry
+from loopcal import engine, geometry
 from loopcal.errors import DataError
 from loopcal.measure.array_checks import (
     check_array,
     check_names,
     check_point,
     check_pose,
+    drop_repeats,
     set_fields,
 )
 from loopcal.measure.kinds import setup_parameters as setup
@@ -39,6 +40,9 @@ from loopcal.units import Dimension
 # The g columns of each target (.., k, g), their derivatives (.., k, g, 3) by its coordinates in the
 # frame, and (.., k, g, w) by the setup items that only this kind has.
 Prediction = tuple[FloatArray, FloatArray, Mapping[str, FloatArray]]
+
+ITEMS = ("frame", "targets")
+IDENTITY = np.eye(3)
 
 
 def name_point(pose: str, target: str, targets: Sequence[str]) -> str:
@@ -81,7 +85,7 @@ class TargetKind(Kind):
     of: str = ""
 
     measures_points: ClassVar[bool] = True
-    allowed_unknown: ClassVar[tuple[str, ...]] = ("frame", "targets")
+    allowed_unknown: ClassVar[tuple[str, ...]] = ITEMS
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -165,7 +169,7 @@ class TargetKind(Kind):
     def _predict(self, T: FloatArray, values: FloatArray, joints: FloatArray) -> Evaluation:
         x, rows = self.locate_targets(T, values)
         predicted, by_x, by_item = self.predict(x, values)
-        rows = by_x @ rows
+        rows = rows if by_x is IDENTITY else by_x @ rows
         if by_item:
             rows = rows + self.join_columns(by_item, predicted.shape)
         flat = (*predicted.shape[:-2], predicted.shape[-2] * predicted.shape[-1])
@@ -175,8 +179,13 @@ class TargetKind(Kind):
         """Return targets x (.., k, 3) in the frame, and derivatives (.., k, 3, 6 + u), at poses."""
         k = len(self.targets)
         of_frame, places = (self.item_values(values, name) for name in ("frame", "targets"))
-        frame = setup.place_frame(self.T_base_frame, of_frame)
         p = self._stated_places() if places is None else places.reshape(*places.shape[:-1], k, 3)
+        if T.ndim == 4 and values.ndim == 3:
+            points = p if p.ndim == 4 else p[None, None]
+            given = drop_repeats(T), self.T_base_frame, of_frame, points, self._columns
+            if (located := engine.locate_points(*given)) is not None:
+                return located
+        frame = setup.place_frame(self.T_base_frame, of_frame)
         R, Q = T[..., None, :3, :3], np.swapaxes(frame[..., None, :3, :3], -1, -2)
         arm = (R @ p[..., None])[..., 0]
         lever = arm + T[..., None, :3, 3] - frame[..., None, :3, 3]
@@ -189,6 +198,12 @@ class TargetKind(Kind):
             by_place = (Q @ R)[..., None, :] * np.eye(k)[:, None, :, None]
             blocks["targets"] = by_place.reshape(*by_place.shape[:-4], k, 3, 3 * k)
         return (Q @ lever[..., None])[..., 0], self.join_columns(blocks, lever.shape)
+
+    @cached_property
+    def _columns(self) -> tuple[int, int, int]:
+        """First columns of the frame and of targets that are unknown, -1 for none; all columns."""
+        first = [6 + self._slices[i].start if i in self._slices else -1 for i in ITEMS]
+        return first[0], first[1], 6 + len(self._is_length)
 
     def collect_points(
         self, T: FloatArray, measured: FloatArray
@@ -281,7 +296,7 @@ class Position(TargetKind):
 
     def predict(self, x: FloatArray, values: FloatArray) -> Prediction:
         """Return the points themselves."""
-        return x, np.eye(3), {}
+        return x, IDENTITY, {}
 
     def guess_values(self, T: FloatArray, measured: FloatArray) -> FloatArray:
         """Return frame and targets in closed form; DataError where the frame is unknown and all
@@ -349,6 +364,11 @@ class Position(TargetKind):
             f"about their line stays open. Measure poses off the line, or give a known "
             f"T_base_frame"
         )
+
+    @property
+    def guesses_minima(self) -> bool:
+        """Whether frame and targets are found together."""
+        return not self.is_of_base and {"frame", "targets"} <= set(self.unknown)
 
     @property
     def locates_frame(self) -> bool:
