@@ -33,6 +33,30 @@ def write_data(path: Path, rows: list[int], noise: str, error: float) -> None:
     path.write_text(text)
 
 
+STAGE = """format: 1
+family: linear-delta
+name: stage
+source: ours, a linear delta a thousand million times smaller
+units: {length: nm, angle: deg}
+radius: 0.105
+angles: [210, 330, 90]
+arms: 0.22
+stops: 0.3
+readings: drop
+stroke: [0, 0.4]
+home: {z: 0.12}
+workspace: {x: [-0.06, 0.06], y: [-0.06, 0.06], z: [0, 0.25]}
+tolerances: {radius: {sd: 5e-4}, angles: {sd: 0.3}, arms: {sd: 3e-4}, stops: {sd: 5e-4}}
+"""
+
+
+def test_machine_of_picometers_is_calibrated(loopcal) -> None:
+    """All of its poses were one block, which could not be split."""
+    Path("stage.yaml").write_text(STAGE)
+    loopcal("simulate stage.yaml -o d.csv --seed 1 --kind position --sigma-position 1e-5nm")
+    loopcal("calibrate stage.yaml d.csv -o run --hold-out 0.25", "arm3.length")
+
+
 CASES = {
     "perfect": (list(range(20)), "10 um", 0.0),
     "one": ([0], "10 um", 1e-5),

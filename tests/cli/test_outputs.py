@@ -5,6 +5,8 @@ import json
 import os
 import shutil
 import stat
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -220,6 +222,27 @@ def test_removed_working_folder_is_named_as_the_cause(loopcal, tmp_path, monkeyp
     for words in ("plan {} -o plan", "simulate {} -o data.csv", "check {}"):
         said = loopcal(words.format(robot), code=1).err
         assert said.startswith("loopcal: the working folder has disappeared. Change to a folder")
+
+
+REMOVE = """
+import os, sys
+def remove(event, given):
+    if event == "open" and str(given[0]).endswith("five-bar.yaml") and os.path.isdir(sys.argv[1]):
+        os.rmdir(sys.argv[1])
+sys.addaudithook(remove)
+from loopcal.cli.entry_point import main
+sys.exit(main("plan five-bar -o plan".split()))
+"""
+
+
+@pytest.mark.skipif(os.name == "nt", reason="a working folder cannot be removed there")
+def test_working_folder_that_is_removed_while_a_command_runs_is_the_cause(tmp_path) -> None:
+    """It was called a symbolic link without a target."""
+    (gone := tmp_path / "gone").mkdir()
+    words = [sys.executable, "-c", REMOVE, str(gone)]
+    done = subprocess.run(words, cwd=gone, capture_output=True, text=True, check=False)
+    sentence = "loopcal: the working folder has disappeared. Change to a folder that exists.\n"
+    assert (done.returncode, done.stderr) == (1, sentence)
 
 
 def test_folder_that_refuses_new_entries_is_not_called_missing(loopcal) -> None:

@@ -196,12 +196,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             command = find_command(words[0]) if words else None
             if isinstance(command, click.Group) and len(words) > 1:
                 command = command.commands.get(words[1], command)
-            has_folder = False  # from which relative paths count
-            with suppress(OSError):
-                has_folder = Path.cwd().is_dir()
-            if command is not None and not has_folder:
-                sentence = "the working folder has disappeared. Change to a folder that exists."
-                return _refuse(sentence, words, FileNotFoundError())
+            if command is not None and not _has_folder():
+                return _report(FileNotFoundError(), command, words, ())
             code = command_line.main(words, "loopcal", standalone_mode=False, obj=words)
             terminal.flush_output()
             return code if isinstance(code, int) else 0
@@ -210,6 +206,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return 1
         except (Exception, KeyboardInterrupt) as error:  # noqa: BLE001 the one place for all of them
             return _report(error, command, words, tuple(list_outputs()))
+
+
+def _has_folder() -> bool:
+    """Return whether the working folder exists, from which relative paths count."""
+    with suppress(OSError):
+        return Path.cwd().is_dir()
+    return False
 
 
 def _report(
@@ -235,6 +238,8 @@ def _report(
                 sentence, hint = error.message, None
         case click.ClickException():
             sentence = error.format_message()
+        case OSError() | FileError() if not _has_folder():
+            sentence = "the working folder has disappeared. Change to a folder that exists."
         case LoopcalError():
             finding = error.args[0] if error.args else None
             sentence, hint = str(error), find_hint(error.code, command)
