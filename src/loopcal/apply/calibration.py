@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -37,6 +37,7 @@ from loopcal.diagnose.adjusted_uncertainty import (
     is_explainable,
 )
 from loopcal.diagnose.conventions.convention_check import ConventionCheck, check_conventions
+from loopcal.diagnose.cross_validation import ModelChoice, choose_model
 from loopcal.diagnose.error_causes import (
     explain_residuals,
     find_print_scale,
@@ -48,10 +49,16 @@ from loopcal.diagnose.error_causes import (
 from loopcal.diagnose.error_frames import BASE, FITTED, RELATIVE
 from loopcal.diagnose.fit_examination import check_start_values, compute_reading_errors, examine_fit
 from loopcal.diagnose.gauge_freedoms import interpret_fit
+from loopcal.diagnose.identifiable_parameters import (
+    describe_missing_equations,
+    identifiability,
+    suggest_measurements,
+)
 from loopcal.diagnose.measured_points import compare_shapes, report_base_targets
 from loopcal.diagnose.model_discrepancy import find_dense_regions
 from loopcal.diagnose.outliers import find_outliers
 from loopcal.diagnose.residual_patterns import CAUSE, POSE, linearize_examined
+from loopcal.diagnose.value_comparison import compare_with_values
 from loopcal.engine import collect_versions
 from loopcal.errors import DataError, EstimationError
 from loopcal.estimate.determinable_setup import (
@@ -71,6 +78,7 @@ from loopcal.estimate.penalties import LeastSquares
 from loopcal.estimate.posterior import DISCREPANCY
 from loopcal.estimate.prior import refuse_reused_rows
 from loopcal.estimate.problem import problem_of
+from loopcal.estimate.recalibration import Change, recalibrate
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, Severity, report_finding, sort_by_importance
 from loopcal.measure.array_checks import check_type
@@ -81,10 +89,6 @@ from loopcal.measure.readings import fill_in_reading_sigma
 from loopcal.mechanism.model import Mechanism
 from loopcal.results.deferred import later
 from loopcal.typing import Progress, StepCounter, report_no_progress
-
-if TYPE_CHECKING:
-    from loopcal.diagnose.cross_validation import ModelChoice
-    from loopcal.estimate.recalibration import Change
 
 # Codes of data that a geometry cannot reach.
 OUT_OF_REACH = ("residuals.poses-out-of-reach", "residuals.calibrated-out-of-reach")
@@ -255,16 +259,12 @@ def _fit(
     fit_options = replace(options.fit, excluded_poses=excluded)
     count.begin("choosing the parameters" if options.choose_model else "preparing")
     if options.prior is not None:
-        from loopcal.estimate.recalibration import recalibrate
-
         count.begin("fitting")
         how = {"options": fit_options, "progress": count.progress}
         fit, change = recalibrate(robot, data, options.prior, options.free_limb, **how)
         return fit, None, change
     choice = None
     if options.choose_model:
-        from loopcal.diagnose.cross_validation import choose_model
-
         choice = choose_model(robot, data, options=fit_options, progress=count.progress)
         if not choice.chosen.parameters:
             left_out = choice.finding.data["not_compared"]
@@ -275,8 +275,6 @@ def _fit(
         problem = problem_of(select_free_parameters(chosen), data)
         z = problem.free.deviation(chosen.values[None])
         if not has_equations_to_spare(problem, z, LeastSquares()):
-            from loopcal.diagnose.identifiable_parameters import describe_missing_equations
-
             missing = describe_missing_equations(chosen, data) or ""
             counts: dict[str, Any] = {"equations": available, "parameters": free}
             counts |= {"held_out": held_out, "suggestions": missing}
@@ -314,8 +312,6 @@ def _report(
     count.begin("looking for further measurements")
     suggestions = None
     if fit.converged and fit.unidentifiable:
-        from loopcal.diagnose.identifiable_parameters import identifiability, suggest_measurements
-
         analysis = identifiability(fit.robot, fitted, fit.options.rank_tolerance)
         listed = suggest_measurements(analysis)
         suggestions = tuple(s for s in listed if not s.combination.is_harmless)
@@ -323,8 +319,6 @@ def _report(
     heights = map_height_errors(fit, fitted, held_out) if fit.converged else None
     comparison = None
     if options.compare_with is not None:
-        from loopcal.diagnose.value_comparison import compare_with_values
-
         comparison = compare_with_values(fit, options.compare_with)
     examined = () if examination is None else examination.findings
     doubts = () if conventions.finding is None else (conventions.finding,)

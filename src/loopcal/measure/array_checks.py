@@ -69,9 +69,7 @@ def drop_repeats(array: FloatArray) -> FloatArray:
 
 
 def take_rows(array: FloatArray, rows: IntArray | BoolArray) -> FloatArray:
-    """Return rows (k, ..), by index or mask, of an array (r, ..); of equal rows that share their
-    memory without a copy.
-    """
+    """Return rows (k, ..), by index or mask, of an array (r, ..); shared memory stays shared."""
     if not array.size or array.strides[0]:
         return array[rows]
     count = int(np.count_nonzero(rows)) if rows.dtype == bool else len(rows)

@@ -93,9 +93,7 @@ class Gaussian(Noise):
 
 @dataclass(frozen=True, eq=False)
 class Uniform(Noise):
-    """Uniform noise between -limit and +limit (m,) [SI], with sigma = limit / sqrt(3); DataError
-    unless each is above 0.
-    """
+    """Uniform noise between -limit and +limit (m,) [SI], each above 0; sigma = limit / sqrt(3)."""
 
     limit: FloatArray
 

@@ -59,9 +59,7 @@ class StatedSize:
 
 
 def find_size(sd: FloatArray, dimensions: Iterable[Dimension]) -> StatedSize | None:
-    """Return the standard deviation [SI] that all values have, or their root mean square; None
-    where their units differ.
-    """
+    """Return the sd [SI] that all values have, or their root mean square; None for mixed units."""
     units = {SIZE_UNITS[dimension] for dimension in dimensions}
     if len(units) != 1 or not sd.size:
         return None

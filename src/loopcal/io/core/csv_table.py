@@ -46,9 +46,7 @@ from loopcal.units import DISPLAY_UNITS, LARGEST, Dimension, Unit, find_unit, pa
 
 
 def parse_decimals(cells: Sequence[str], factor: float) -> FloatArray:
-    """Return products of finite numbers (n,) with a factor, each rounded once as by `parse_exact`;
-    NaN for other cells.
-    """
+    """Return products of numbers (n,) with a factor, rounded once as by `parse_exact`, or NaN."""
     exact = _as_decimal(factor)
     _, digits, exponent = exact.as_tuple()
     text = "".join(cells)
@@ -282,9 +280,7 @@ class Places(Sequence[str]):
 
 
 def read_table(path: str | Path) -> Table:
-    """Read a CSV table with its settings; FileError for a bad header, bad settings, no rows, or
-    rows of the wrong length.
-    """
+    """Read a CSV table with its settings; FileError for a bad header, settings or rows, or none."""
     table = read_template(path)
     if not len(table):
         sentence = "this file has a header but no rows. Add one row for each pose"
@@ -391,9 +387,7 @@ def _iterate_lines(text: str) -> Iterator[tuple[int, list[str]]]:
 
 
 def _iterate_rows(text: str, first: int) -> Iterator[tuple[list[int], list[str]]]:
-    """Yield numbers and texts of some lines at a time: those below the first ones that are neither
-    blank nor remarks.
-    """
+    """Yield numbers and texts of some lines at a time, below the first: no blanks or remarks."""
     for count, lines in _iterate_lines(text):
         begin = max(first - count, 0)
         rows = [

@@ -215,9 +215,7 @@ def _take_free_name(temporary: Path, target: Path) -> bool:
 
 @contextmanager
 def restore_files(targets: Sequence[Path]) -> Iterator[None]:
-    """Restore files, or their absence, where the body fails: all of them or none. A new file of
-    another command stays.
-    """
+    """Restore all files, or their absence, where the body fails; new files of others stay."""
     for target in targets:
         remove_leftovers(target, Path.is_file)
     asides = {target: _name_beside(target, OLD) for target in targets if target.exists()}
@@ -481,9 +479,7 @@ def replace_file(path: str | Path) -> Iterator[Path]:
 
 
 def _take_new_name(temporary: Path, target: Path, path: str | Path) -> None:
-    """Give a file a second name that was free when the command began; FileError where another
-    command has taken it since.
-    """
+    """Give a file the name that was free before; FileError where another command has taken it."""
     try:
         try:
             target.hardlink_to(temporary)

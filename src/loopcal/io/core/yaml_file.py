@@ -134,9 +134,7 @@ def _load_content(
 
 @lru_cache(KEPT_TEXTS)
 def _compose(text: str) -> Any:
-    """Return the nodes of a YAML text as ruamel.yaml composes them, None without any; each knows
-    its place in the text.
-    """
+    """Return the nodes of a YAML text as ruamel.yaml composes them, with places; None for none."""
     yaml = make_yaml()
     yaml.composer.warn_double_anchors = False  # YAML allows an anchor again, for another value
     yaml.max_depth = YAML_DEPTH.count  # deep text takes the square of its depth to read

@@ -272,9 +272,7 @@ def _has_readings(table: Table, robot: Mechanism) -> bool:
 
 
 def _read_file(table: Table, kinds: tuple[KindRows, ...], robot: Mechanism, several: bool) -> _File:
-    """Read the names of the poses of one file, which the rows of the base do not name, and their
-    readings where it has any.
-    """
+    """Read the names of the poses of one file, but those of rows of the base, and any readings."""
     is_base = np.zeros(len(table), dtype=bool)
     for entry in (entry for entry in kinds if entry.kind.is_of_base):
         is_base[entry.rows] = True

@@ -326,9 +326,7 @@ class DeltaFirmware:
         return lengths + lengths[:1] * (3 - len(lengths))
 
     def list_arms(self, arms: Triple, is_new: bool) -> tuple[Words, tuple[Finding, ...]]:
-        """Return the words of arms, and what they need: one length where all are equal, with trims
-        only in an existing file.
-        """
+        """Return the words of arms and what they need: one length, or trims in an existing file."""
         is_equal = is_same(*((arm, arms[0]) for arm in arms))
         code = "files.marlin-rod-trims" if self.has_trims else "files.reprap-rod-lengths"
         findings = () if is_equal else (report_finding(code),)

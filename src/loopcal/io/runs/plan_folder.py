@@ -143,9 +143,7 @@ def _read_plan(sheet: Path) -> Mapping[str, Any]:
 
 
 def find_plan_robot(sheet: Path) -> tuple[str, bool]:
-    """Return the robot file that a plan was made for, and whether it has changed since; FileError
-    where it is not known.
-    """
+    """Return the robot file of a plan, and whether it has changed since; FileError if unknown."""
     with open_bytes(sheet, "measurement file"):
         file = _read_plan(sheet).get("made_by", {}).get("inputs", {}).get("robot", {})
     path = str(file.get("path", ""))

@@ -296,9 +296,7 @@ class Kind(ABC):
         """Return instances that together show every setting, for documentation and tests."""
 
     def with_tool(self, T_platform_tool: FloatArray) -> Self:
-        """Return the kind for a robot with this tool (4, 4); the same object where the tool does
-        not matter or is stated.
-        """
+        """Return the kind for a robot with this tool (4, 4); itself where it has no need of it."""
         return self
 
     @property
