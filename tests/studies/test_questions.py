@@ -75,8 +75,9 @@ def test_the_smallest_number_of_poses_is_found_for_every_other_combination(
     }
     question, *lines = str(answered).splitlines()
     assert "smallest level of poses" in question
-    assert len(lines) == 4
-    assert lines[0].startswith("  noise 1, method map: 20 (10: 50 %")
+    rows = [line.split() for line in lines if line.startswith(("1 ", "2 "))]
+    assert len(rows) == 4
+    assert rows[0][:5] == ["1", "map", "20", "10:", "50"]
     first = answered.answers[0]
     assert (first.quantity, first.unit, first.best) == ("count", "1", "20")
     assert [(s.level, s.value, s.reached, s.state) for s in first.shares] == [

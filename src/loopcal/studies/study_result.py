@@ -34,7 +34,8 @@ from loopcal.findings.catalog import find_entry
 from loopcal.io.core.text_file import replace_file, to_json, write_bytes, write_text
 from loopcal.report.words import say
 from loopcal.results.description import Records, Variable
-from loopcal.results.result import TableResult
+from loopcal.results.presenters import register
+from loopcal.results.result import Result, TableResult
 from loopcal.results.tables import (
     ABSENT,
     Block,
@@ -584,7 +585,7 @@ class Answer:
 
 
 @dataclass(frozen=True)
-class AnsweredQuestion:
+class AnsweredQuestion(Result):
     """A question with answers; `name` in the file, `limit` in SI, `score_unit` of its score."""
 
     name: str
@@ -605,16 +606,6 @@ class AnsweredQuestion:
             f"{name}{asked.wanted} level of {asked.factor} with {score} up to {limit} on "
             f"{_percent(asked.share)} % of machines"
         )
-
-    def __str__(self) -> str:
-        """Return the question, and one line for each answer with the shares that decide it."""
-        lines = [f"{self.title}:"]
-        for answer in self.answers:
-            levels = [f"{factor} {level}" for factor, level in answer.levels.items()]
-            named = ", ".join([*levels, *([answer.chain] if answer.chain else [])])
-            said = f"{say_answer(answer, self.question.wanted)} ({say_deciding_shares(answer)})"
-            lines.append(f"  {named}: {said}" if named else f"  {said}")
-        return "\n".join(lines)
 
 
 def answer_question(store: StudyStore, question: Question, name: str = "") -> AnsweredQuestion:
@@ -710,6 +701,12 @@ def view_answers(answered: Sequence[AnsweredQuestion]) -> list[Block]:
     if any(answer.certainty == "between" for item in answered for answer in item.answers):
         return [*page, f"{say('study.shares')} {say('study.extend')}"]
     return [*page, say("study.shares")] if page else []
+
+
+@register("page", AnsweredQuestion)
+def _view_answer(answered: AnsweredQuestion) -> list[Block]:
+    """Return the page of one answered question."""
+    return view_answers((answered,))
 
 
 def tabulate_answers(answered: AnsweredQuestion) -> Table:
