@@ -12,7 +12,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from importlib import import_module
 from importlib.util import find_spec
 
@@ -126,8 +126,9 @@ def _make_numpy_engine() -> Engine:
     from loopcal.engine.numpy_engine.householder import fold
     from loopcal.engine.numpy_engine.newton import solve
     from loopcal.engine.numpy_engine.sensitivity import differentiate, fold_poses
-    from loopcal.engine.numpy_engine.targets import reach
+    from loopcal.engine.numpy_engine.targets import reach_by
 
+    reach = partial(reach_by, solve, certify)
     functions = solve, certify, reach, linearize, fold, differentiate, fold_poses
     return Engine(NUMPY, np.__version__, *functions)
 

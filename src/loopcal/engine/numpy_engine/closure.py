@@ -66,8 +66,7 @@ class PlacedLinks(NamedTuple):
     Shapes end in (k, t), or in (k, 1) where all trials are the same. nominal : rotations without
     displacement (J + 2, 3, 3, ..). rotation : the displaced ones. slope : rotation of a link per
     unit of w, nominal . left_jacobian(w). origin : displaced origins (J + 2, 3, ..) [m]. pitch :
-    (J, ..). length : (k, ..) of the rods. rotates : for each link, whether its rotation can differ
-    from the identity.
+    (J, ..). length : (k, ..) of the rods.
     """
 
     nominal: FloatArray
@@ -76,15 +75,10 @@ class PlacedLinks(NamedTuple):
     origin: FloatArray
     pitch: FloatArray
     length: FloatArray
-    rotates: tuple[bool, ...]
 
     def select(self, trial: np.ndarray) -> PlacedLinks:
         """Return the links of each row's trial; a single trial serves all rows."""
-        if self.origin.shape[-1] == 1:
-            return self
-        arrays = (self.nominal, self.rotation, self.slope, self.origin, self.pitch, self.length)
-        own = (a if a.shape[-1] == 1 else a.take(trial, axis=-1) for a in arrays)
-        return PlacedLinks(*own, rotates=self.rotates)
+        return PlacedLinks(*(a if a.shape[-1] == 1 else a.take(trial, axis=-1) for a in self))
 
 
 def place_links(group: Group, e: FloatArray) -> PlacedLinks:
@@ -105,15 +99,12 @@ def place_links(group: Group, e: FloatArray) -> PlacedLinks:
     transforms = group.links.transpose(1, 2, 3, 0)[..., None]
     nominal = rotation = slope = transforms[:, :3, :3]
     shift = sum(nominal[:, :, i] * move[:, None, 3 + i] for i in range(3))
-    displaced = {slot.element for slot in group.slots if slot.axis < 3}
-    if displaced:
-        rotation, slope = (np.repeat(nominal, t, axis=-1) for _ in range(2))
-    for j in displaced:
-        rotation[j] = matmul(nominal[j], exponential(move[j, :3]))
-        slope[j] = matmul(nominal[j], left_jacobian(move[j, :3]))
-    rotates = tuple(j in displaced or not plain for j, plain in enumerate(group.has_plain_link))
-    origin = transforms[:, :3, 3] + shift
-    return PlacedLinks(nominal, rotation, slope, origin, pitch, length, rotates)
+    if any(slot.axis < 3 for slot in group.slots):
+        turned, whole = move[:, :3].swapaxes(0, 1), np.moveaxis(nominal, 0, 2)
+        rotation, slope = (
+            np.moveaxis(matmul(whole, turn(turned)), 2, 0) for turn in (exponential, left_jacobian)
+        )
+    return PlacedLinks(nominal, rotation, slope, transforms[:, :3, 3] + shift, pitch, length)
 
 
 def list_bodies(state: State) -> FloatArray:
@@ -131,22 +122,6 @@ class Chain:
     `direction` and `moment`.
     """
 
-    group: Group
-    links: PlacedLinks
-    theta: FloatArray
-    size: float
-    last: int
-    carrier: FloatArray | None
-    before: list[FloatArray | None]
-    axes: list[FloatArray]
-    origins: list[FloatArray]
-    platform: FloatArray
-    tip: FloatArray
-    tip_rotation: FloatArray
-    arm: FloatArray
-    gap: FloatArray
-    distance: FloatArray
-
     def __init__(
         self, group: Group, links: PlacedLinks, bodies: FloatArray, theta: FloatArray, size: float
     ) -> None:
@@ -154,13 +129,14 @@ class Chain:
         self.last = len(group.joints) + 1
         # rotation before each link, axis of each joint, origin behind each link
         rotation, point = links.rotation[0], links.origin[0]
-        self.carrier = None
+        self.carrier: FloatArray | None = None
         if group.on[0] != BASE:
             self.carrier = carrier = _select_bodies(bodies, group.on)
             rotation = matmul(carrier[:, :3], rotation)
             point = matvec(carrier[:, :3], point) + carrier[:, 3]
-        self.before = [None if self.carrier is None else self.carrier[:, :3]]
-        self.axes, self.origins = [], [point]
+        before = None if self.carrier is None else self.carrier[:, :3]
+        self.before: list[FloatArray | None] = [before]
+        self.axes, self.origins = list[FloatArray](), [point]
         for j, letter in enumerate(group.joints):
             axis, value = rotation[:, 2], theta[j]
             self.axes.append(axis)
@@ -173,8 +149,7 @@ class Chain:
             self.before.append(rotation)
             point = point + matvec(rotation, links.origin[j + 1])
             self.origins.append(point)
-            if links.rotates[j + 1]:
-                rotation = matmul(rotation, links.rotation[j + 1])
+            rotation = matmul(rotation, links.rotation[j + 1])
         end = _select_bodies(bodies, group.to)
         self.platform = end[:, :3]
         self.before.append(self.platform)

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import reduce
+from functools import cached_property, reduce
 from typing import NamedTuple
 
 import numpy as np
@@ -400,7 +400,7 @@ class _Equations:
                 turns[i] = back_substitute(top[:, :u], -rest[:, None])[:, 0]
         driven = y.get(len(program.nodes), np.zeros((0, N)))
         step = np.concatenate([twist, *(turn.reshape(-1, N) for turn in turns), driven])
-        length = self._length(twist, turns, driven)
+        length = np.abs(step * self.units).max(axis=0)
         return Iterate(coordinates, step, norm, reducible, length, sign, pivot)
 
     def measure(self, coordinates: FloatArray, of: np.ndarray) -> FloatArray:
@@ -478,21 +478,17 @@ class _Equations:
             rows = rows + chain.rows_of_joint(j) * share[:, None]
         return rows
 
-    def _length(self, twist: FloatArray, turns: list[FloatArray], driven: FloatArray) -> FloatArray:
-        """Return the length of a step [m]: its largest part, an angle times the robot's size."""
-        size = self.program.size
-        parts = np.abs(twist).reshape(-1, 2, 3, twist.shape[1])
-        turned, moved = np.maximum.reduce(parts, axis=(0, 2))
-        length = np.maximum(turned * size, moved)
-        for group, unknown, turn in zip(self.program.groups, self.unknown, turns, strict=True):
-            for j, part in zip(unknown, turn, strict=True):
-                unit = size if group.joints[j : j + 1] == "R" else 1.0
-                length = np.maximum(length, np.abs(part).max(axis=0) * unit)
-            for j in group.driven_joints if len(driven) else ():
-                unit = size if group.joints[j : j + 1] == "R" else 1.0
-                part = driven[group.actuator[j]]
-                length = np.maximum(length, np.abs(part).max(axis=0) * unit)
-        return length
+    @cached_property
+    def units(self) -> FloatArray:
+        """Lengths (s, 1) [m] of a unit of each entry of a step: the robot's size for an angle."""
+        program, driven = self.program, np.ones(self.program.n_joints)
+        units = len(program.nodes) * np.repeat([program.size, 1.0], 3).tolist()
+        for group, unknown in zip(program.groups, self.unknown, strict=True):
+            of = [program.size if letter == "R" else 1.0 for letter in f"{group.joints}P"]
+            units += [of[j] for j in unknown for _ in group.limbs]
+            for j in group.driven_joints:
+                driven[group.actuator[j]] = of[j]
+        return np.array(units if self.sums is None else [*units, *driven])[:, None]
 
     def lead_to(self, now: Iterate, goal: FloatArray) -> BoolArray:
         """Return which full steps (N,) lead close to the platform of a goal (3, 4, N)."""

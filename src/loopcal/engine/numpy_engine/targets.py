@@ -13,15 +13,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from loopcal.engine.numpy_engine.certificate import certify
-from loopcal.engine.numpy_engine.newton import solve
 from loopcal.engine.program import CONVERGED, NEAR_GOAL, Program, Reached, State, Target
 from loopcal.typing import FloatArray
-
-
-def reach(program: Program, e: FloatArray, target: Target, start: State) -> Reached:
-    """Close the loops at target poses; see `loopcal.engine.reach`."""
-    return reach_by(solve, certify, program, e, target, start)
 
 
 def reach_by(
@@ -32,7 +25,7 @@ def reach_by(
     target: Target,
     start: State,
 ) -> Reached:
-    """Return what `reach` returns by two other functions of an engine."""
+    """Close the loops at target poses by two functions of an engine; see `loopcal.engine.reach`."""
     limbs, first = program.with_fixed_platform, replace(start, T=target.poses)
     state = solve(limbs, e, program.list_drives(start.joints), first, free=True)
     q = program.list_drives(state.joints)
