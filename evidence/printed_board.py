@@ -217,7 +217,7 @@ class Scene:
 
 
 def build_scene(machine: Machine, rng: np.random.Generator, poses: int) -> Scene:
-    """Return a machine whose errors are drawn from its tolerances, at drawn poses."""
+    """Return a machine whose errors are drawn from its spreads, at drawn poses."""
     table = load_robot(machine.robot).parameters
     nominal = dict(zip(table.names, table.nominal.tolist(), strict=True))
     truth = {
@@ -255,7 +255,7 @@ class Sample:
 
 
 def simulate_machine(machine: Machine, seed: int, poses: int = POSES) -> Sample:
-    """Return the pictures of a machine whose errors are drawn from its tolerances."""
+    """Return the pictures of a machine whose errors are drawn from its spreads."""
     rng, robot = np.random.default_rng([SEED, seed]), load_robot(machine.robot)
     scene = build_scene(machine, rng, poses + PREDICTED)
     square, (columns, rows) = machine.square, CORNERS

@@ -249,7 +249,7 @@ def test_predicted_pose_errors_agree_with_simulated_calibrations(name, method):
     low, high = chi_interval(result.trials, len(ratio))
     assert (result.trials, result.failed) == (trials, 0)
     assert len(ratio) == (18 if name == "linear-delta" else 36)
-    # one trial's decomposition stands for all: 3 % for truths that differ by their tolerances
+    # one trial's decomposition stands for all: 3 % for truths that differ by their spreads
     assert ratio.min() > 0.97 * low
     assert ratio.max() < 1.03 * high
     assert (ratio / 1.5).min() < 0.97 * low  # a prediction 50 % too large would fail

@@ -64,7 +64,7 @@ INSTRUMENT, READINGS, SETUP, COMMON = "instrument", "readings", "setup", "common
 EARLIER, REPEATABILITY = "earlier calibration", "repeatability"
 # Kinds of sources whose errors the fit weighs against each other.
 OF_ROWS = (INSTRUMENT, READINGS, SETUP, COMMON, TOLERANCES, EARLIER)
-PRIOR = "prior."  # begins codes of findings on the tolerances, whose errors count as theirs
+PRIOR = "prior."  # begins codes of findings on the spreads, whose errors count as theirs
 POSES, SEED = 200, 0  # number and seed of the poses that are drawn from the workspace
 NEGLIGIBLE = 0.01  # share of an expected error below which the sentence leaves out a source
 LENGTHS = {"position": Dimension.LENGTH, "orientation": Dimension.ANGLE}
@@ -128,7 +128,7 @@ class CovarianceSplit(NamedTuple):
 
     sources: tuple[Source, ...]  # of errors
     roots: tuple[FloatArray, ...]  # (p, k) [SI] for each, whose squares add up to the covariance
-    # (p,) parameters of infinite variance, of which the roots contain what the tolerances allow
+    # (p,) parameters of infinite variance, of which the roots contain what the spreads allow
     undetermined: BoolArray
     numbered: NumberedSources
     factors: tuple[SourceFactor, ...]  # of the numbered sources
@@ -202,7 +202,7 @@ def _halve_sigma(
     linear: FitLinearization, split: CovarianceSplit, source: Source, *, moves_frames: bool
 ) -> tuple[FloatArray, Linearization, Problem] | None:
     """Return a root (p, k) [SI] of the covariance without added parts if the sigma of a source of
-    rows or of the tolerances were half as large, with its linearization; None for other sources.
+    rows or of the spreads were half as large, with its linearization; None for other sources.
 
     Every weight is that of the smaller sigma. Estimates stay, and so does a scale of the noise that
     the residuals gave. Where all rows of a source are alone in their clusters of setup parameters,
@@ -372,11 +372,11 @@ def _list_further_rows(
 def _propagate(
     linear: FitLinearization, factors: Sequence[SourceFactor], weight: float = 1.0
 ) -> list[FloatArray]:
-    """Return for each factor of rows, and for the tolerances at the end, the error of the machine
+    """Return for each factor of rows, and for the spreads at the end, the error of the machine
     (p, k) [tolerances].
 
     With [A; P^(1/2)] = Q R, b A_k' is R^-1 Q_k'. A'A is never formed. A direction that is not
-    estimated has its tolerance. The penalty P is that of the fit times a weight.
+    estimated has its spread. The penalty P is that of the fit times a weight.
     """
     used, noise = linear.is_estimated, float(np.sqrt(linear.sources.noise))
     to_z = linear.decomposition.directions[0]
@@ -398,7 +398,7 @@ def _separate_setup(
     noise: float,
 ) -> tuple[list[FloatArray], FloatArray]:
     """Return the errors e (p, k) of the machine that are uncorrelated with those of the setup
-    parameters, for each factor and for the tolerances, and a root (p, r + p) of the others.
+    parameters, for each factor and for the spreads, and a root (p, r + p) of the others.
 
     Factors that are not `kept`, common errors of an instrument, stay whole: they also move frames,
     and would seem to be errors of these. is_setup : (U,) parameters that are no such errors.
@@ -513,7 +513,7 @@ class ErrorBudget(DrawnResult):
     position, orientation : variances of the tool's place and of the rotation, by kind of source.
     lines : every source. sd : (p,) standard deviations of the parameters `names` [SI]; infinite for
         undetermined ones. worst : name of the determined parameter with the largest standard
-        deviation in tolerances; empty where none is determined.
+        deviation in spreads; empty where none is determined.
     poses : number of poses. is_workspace : whether they are drawn from the workspace of the robot;
         otherwise they are those that were measured.
     finding : the errors of poses with their frame, in one sentence.

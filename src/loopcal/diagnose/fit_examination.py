@@ -114,7 +114,7 @@ class CalibrationGain:
 def estimate_calibration_gain(
     fit: Identification, data: Measurements, frame: str = FITTED
 ) -> CalibrationGain:
-    """Compare the errors expected after calibration with those that the stated tolerances allow.
+    """Compare the errors expected after calibration with those that the stated spreads allow.
 
     data : the measurements that were fitted, or other readings. frame : in which the errors are
         stated, see `choose_error_frame`; "relative" means relative to the home pose.

@@ -3,7 +3,7 @@
 suggest further measurements that determine what they leave open.
 
 Singular values are those of whitened rows in units of tolerance. Every kind of measurement is
-tested: with a basis B (d, p) of the unidentifiable combinations, in tolerances, and the triangular
+tested: with a basis B (d, p) of the unidentifiable combinations, in spreads, and the triangular
 factor X of the rows of a further instrument (its nuisance parameters eliminated), the null space of
 X B' stays open. A combination is determined when no direction of that null space has a part in it.
 """
@@ -138,7 +138,7 @@ class ParameterIdentifiability:
     # parameters with which only a combination is determined; only itself where it has no effect;
     # empty where it is determined
     partners: tuple[str, ...]
-    # standard deviation with the tolerances as a prior, over the tolerance: 1 where nothing is
+    # standard deviation with the spreads as a prior, over the spread: 1 where nothing is
     # learned
     left: float
 
@@ -159,14 +159,14 @@ class ParameterIdentifiability:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Identifiability(DrawnResult):
-    """What measurements determine, in units of sigma (rows) and tolerance (columns).
+    """What measurements determine, in units of sigma (rows) and expected spread (columns).
 
     Attributes
     ----------
     free_parameters : the free parameters.
     factor : (p, p) triangular factor of the rows. decomposition : of that factor (one trial).
     unidentifiable : combinations of parameters that change no measured value.
-    weak : the weakest directions known no better than the tolerances, weakest first.
+    weak : the weakest directions known no better than the spreads, weakest first.
     indices : observability O1 to O5. parameters : the result for each parameter.
     scale : what the lengths follow from, where only pictures of a board show any.
     """
@@ -278,7 +278,7 @@ class Identifiability(DrawnResult):
 
     @property
     def posterior(self) -> Posterior:
-        """What is known of the parameters with the tolerances as a prior."""
+        """What is known of the parameters with the spreads as a prior."""
         free, d = self.free_parameters, self.decomposition
         if free.correlation is not None:
             d = restate(d, free.correlation)
@@ -286,7 +286,7 @@ class Identifiability(DrawnResult):
         return compute_posterior(free.robot, free.places, free.tolerance, d, penalty)
 
     def null_space(self) -> FloatArray:
-        """Return (p, d) orthonormal deviations in tolerances that change no measured value."""
+        """Return (p, d) orthonormal deviations in spreads that change no measured value."""
         return self.decomposition.null_space()
 
 
@@ -301,7 +301,7 @@ def identifiability(
 
     Parameters
     ----------
-    robot : its values, free parameters and tolerances.
+    robot : its values, free parameters and spreads.
     data : measurements, or an instrument that measures `poses` positions drawn from the robot's
         workspace by `seed`. Measured values matter only by their presence, and by locating
         unknown frames, targets and surfaces, which are eliminated.
@@ -369,7 +369,7 @@ def identifiability(
 
 
 def compute_remaining_sd(rows: FloatArray, root: FloatArray) -> FloatArray:
-    """Return the standard deviations (p,) over tolerances by rows (m, p) and the tolerances as a
+    """Return the standard deviations (p,) over spreads by rows (m, p) and the spreads as a
     prior, whose correlation is root root'.
     """
     _, s, vt = np.linalg.svd(rows @ root, full_matrices=False)
@@ -396,8 +396,8 @@ class FurtherMeasurement:
 
     words: str  # what is measured, such as `psi`
     kind: str  # its kind
-    # standard deviation of the first parameter of the combination over its tolerance, from the
-    # data, the further measurement and the tolerances together
+    # standard deviation of the first parameter of the combination over its spread, from the
+    # data, the further measurement and the spreads together
     left: float
 
 
@@ -555,7 +555,7 @@ def _measure_at(scene: ObservedPoses, kind: Kind, sigma: dict[Dimension, float])
 # A minimal set of parameters that carries all information of measurements, and what they determine
 # to a useful accuracy.
 #
-# With a basis N (p, d) of the null space, in tolerances, fixing d parameters loses nothing if their
+# With a basis N (p, d) of the null space, in spreads, fixing d parameters loses nothing if their
 # rows N_d are nonsingular. Then B = N N_d^-1 has the identity in those rows, and to first order a
 # change z of a fixed parameter is the change -B z of the kept ones. The fixed parameters are chosen
 # by elimination with pivoting on N', each column multiplied by a weight: those with the largest
@@ -672,7 +672,7 @@ def _weights(free: FreeParameters) -> FloatArray:
         addresses = (link.address,) if isinstance(link, LinearMap) else link.outputs
         if any(address.element == "transmission" for address in addresses):
             settable.update((link.parameter,) if isinstance(link, LinearMap) else link.inputs)
-    # nominal values are computed: what is far below its tolerance is zero
+    # nominal values are computed: what is far below its spread is zero
     is_zero = np.abs([p.nominal for p in free.parameters]) <= NEGLIGIBLE * free.tolerance
     is_settable = np.array([p.name in settable for p in free.parameters], dtype=bool)
     return np.where(is_settable, SETTABLE, np.where(is_zero, 1.0, NONZERO))

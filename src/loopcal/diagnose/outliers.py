@@ -64,7 +64,7 @@ TESTABLE = 1e-6
 # Variance of a predicted residual outside the fit, in units of the noise, above which the fit
 # does not predict it.
 UNPREDICTABLE = 1e10
-# Standard deviation in tolerances that stands in G for a direction that the fit does not use.
+# Standard deviation in spreads that stands in G for a direction that the fit does not use.
 UNDETERMINED = 1e6
 
 

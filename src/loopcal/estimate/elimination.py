@@ -107,7 +107,7 @@ class NuisanceElimination:
     """The U nuisance parameters of a problem and their elimination tree.
 
     local : their table, and which rows use them. tree : in which order they are eliminated.
-    is_free : (U,). has_prior : (U,) free with a tolerance.
+    is_free : (U,). has_prior : (U,) free with a spread.
     prior_mean : (T | 1, U) [SI] means of the priors of T trials.
     """
 

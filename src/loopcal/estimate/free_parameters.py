@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The free parameters of a robot, each in units of its tolerance.
+"""The free parameters of a robot, each in units of its spread.
 
 Rank, null space, the smallest deviation and every penalty depend on these units, so they are part
-of the result. Where no tolerance is stated, a default one scales the parameter.
+of the result. Where no spread is stated, a default one scales the parameter.
 
 The null space consists of combinations of them that change no measured value. Its basis is brought
 to a sparse form, in which each combination has a leading parameter of its own, by elimination with
@@ -30,7 +30,7 @@ from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension
 
 DEFAULT_TOLERANCE = 1e-3
-"""Tolerance where none is stated: this share of the robot's size for lengths, this many radians for
+"""Spread where none is stated: this share of the robot's size for lengths, this many radians for
 angles, this value for ratios.
 """
 
@@ -43,7 +43,7 @@ class FreeParameters:
     places : (p,) positions of the free parameters in the robot's table.
     nominal, tolerance : (p,) [SI].
     assumed : (p,) True where the tolerance is the default one.
-    correlation : (p, p) of the deviations z by the tolerances; None where they are independent,
+    correlation : (p, p) of the deviations z by the spreads; None where they are independent,
         because the robot states no common errors.
     errors : errors of the poses whose coefficients follow as more columns, to see what data say of
         them; they are zero in every fit.
@@ -102,7 +102,7 @@ class FreeParameters:
 
     def prior_rows(self) -> FloatArray:
         """Return independent rows (k, p) of unit variance by deviations z, that the stated
-        tolerances amount to: the inverse of the Cholesky factor.
+        spreads amount to: the inverse of the Cholesky factor.
         """
         inverse = np.asarray(np.linalg.inv(self.correlation_root()), dtype=np.float64)
         return inverse[~self.assumed]
@@ -115,7 +115,7 @@ class FreeParameters:
         return np.array([unit.factor_to_si for unit in units]), tuple(u.symbol for u in units)
 
     def list_assumed(self, factor: float = 1.0) -> tuple[Quantity, ...]:
-        """Return the default tolerance of each dimension that has one, times a factor."""
+        """Return the default spread of each dimension that has one, times a factor."""
         assumed = []
         for dimension in Dimension:
             chosen = [p.dimension is dimension for p in self.parameters] & self.assumed
@@ -125,7 +125,7 @@ class FreeParameters:
         return tuple(assumed)
 
     def findings(self) -> tuple[Finding, ...]:
-        """Return a finding on default tolerances; nothing where all tolerances are stated."""
+        """Return a finding on default spreads; nothing where all spreads are stated."""
         count, assumed = int(self.assumed.sum()), self.list_assumed()
         if count == 0:
             return ()
@@ -134,7 +134,7 @@ class FreeParameters:
 
 
 def select_free_parameters(robot: Mechanism) -> FreeParameters:
-    """Return the free parameters of a robot with their tolerances, stated or default.
+    """Return the free parameters of a robot with their spreads, stated or default.
 
     MechanismError
         The robot is over-constrained, and its loops do not close with other values of some.
@@ -170,7 +170,7 @@ def free_only(robot: Mechanism, names: Iterable[str]) -> Mechanism:
 
 
 NEGLIGIBLE = 1e-6
-"""Part of a combination, in tolerances and relative to its largest, that is rounding and left out.
+"""Part of a combination, in spreads and relative to its largest, that is rounding and left out.
 """
 
 MINOR = 0.1
@@ -189,12 +189,12 @@ class Combination(Result):
     Attributes
     ----------
     names : (k,) strongest first. changes : (k,) changes that belong together, in `units` (symbols).
-    weights : (k,) the same in tolerances, of length one over all parameters.
-    singular_value : change of the whitened residuals per tolerance along the direction, in standard
+    weights : (k,) the same in spreads, of length one over all parameters.
+    singular_value : change of the whitened residuals per spread along the direction, in standard
         deviations of the noise; 0 for a null direction.
     meaning : what the robot does with such a change; empty where it is no rigid motion.
     nuisance : frames, targets and surfaces of the measurements that change with it.
-    direction : (p,) all parameters, in tolerances, with the parts that are left out.
+    direction : (p,) all parameters, in spreads, with the parts that are left out.
     """
 
     names: tuple[str, ...]
@@ -235,14 +235,14 @@ class Combination(Result):
 
 
 def describe_null_space(free: FreeParameters, null_space: FloatArray) -> tuple[Combination, ...]:
-    """Return the combinations that span a null space (p, d) of deviations in tolerances."""
+    """Return the combinations that span a null space (p, d) of deviations in spreads."""
     return tuple(describe_direction(free, direction) for direction in sparsify_basis(null_space))
 
 
 def describe_direction(
     free: FreeParameters, direction: FloatArray, singular_value: float = 0.0
 ) -> Combination:
-    """Return a direction (p,) of deviations in tolerances by names; small parts are left out."""
+    """Return a direction (p,) of deviations in spreads by names; small parts are left out."""
     factor, symbols = free.display()
     size = np.abs(direction)
     chosen = np.flatnonzero(size > (MINOR if singular_value > 0.0 else NEGLIGIBLE) * size.max())

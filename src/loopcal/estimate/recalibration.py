@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Two calibrations of a machine: whether it has changed, and the earlier one as prior of the next.
 
-Both say what their data alone determine, without tolerances, which both share; the difference is
+Both say what their data alone determine, without spreads, which both share; the difference is
 compared with the noise that the residuals of both show, so that a wrong sigma moves no machine. A
 change of the whole machine, of each limb and of each parameter is tested, and the probability is
 that of the clearest of these tests. See docs/theory/uncertainty.md.
@@ -98,9 +98,9 @@ def recalibrate(
     ----------
     robot : its table states what is nominal and tolerated. data : the new measurements.
     earlier : `Identification.posterior`, or the one of a run folder.
-    free_limb : a limb that was repaired. Its parameters get the tolerances of the robot file about
+    free_limb : a limb that was repaired. Its parameters get the spreads of the robot file about
         nominal again; the others keep what the earlier calibration knows of them.
-    options : see `FitOptions`. The method is least squares: the prior replaces the tolerances.
+    options : see `FitOptions`. The method is least squares: the prior replaces the spreads.
     progress : receives the fits that are done where the machine has changed.
 
     Returns
@@ -132,7 +132,7 @@ def recalibrate(
     alone = replace(options, method=None, noise="given", allow_fewer_equations=True)
     later = identify(robot, data, options=alone, progress=progress)
     change = assess_change(earlier, later, names, free_limb or MACHINE)
-    if free_limb is not None:  # a freed limb is at its tolerances again
+    if free_limb is not None:  # a freed limb is at its spreads again
         places = [free.names.index(name) for name in names]
         nominal, tolerance = free.nominal[places], free.tolerance[places]
         prior = prior.without(names).toleranced(names, nominal, tolerance)
@@ -246,7 +246,7 @@ class ParameterChanges:
         return np.where(is_open, np.nan, compute_f_tail(1.0, degrees, square))
 
     def _invert(self) -> tuple[FloatArray, BoolArray]:
-        """Return the matrix (p, k) that gives the shifts in tolerances of values, and which
+        """Return the matrix (p, k) that gives the shifts in spreads of values, and which
         parameters (p,) it does not determine.
         """
         u, s, vt = np.linalg.svd(self.slope * self.unit, full_matrices=False)

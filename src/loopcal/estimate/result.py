@@ -171,7 +171,7 @@ def label_residuals(
     )
 
 
-# Deviation from nominal, in stated tolerances (standard deviations), that contradicts the
+# Deviation from nominal, in stated spreads (standard deviations), that contradicts the
 # tolerance; noise alone does not cause it.
 FAR = 10.0
 LOW_WEIGHT = 0.5  # weight of a pose below which it is named
@@ -186,9 +186,9 @@ STATUS_CODES = {
 def report_divergence(
     free: FreeParameters, deviation: FloatArray, method: Method, converged: bool
 ) -> list[Finding]:
-    """Return findings on estimates (p,) far beyond their stated tolerances, in these.
+    """Return findings on estimates (p,) far beyond their stated spreads, in these.
 
-    Nothing is reported where the tolerances are a prior: then `PriorConflict` tests them.
+    Nothing is reported where the spreads are a prior: then `PriorConflict` tests them.
     """
     if method.has_prior:
         return []
@@ -226,7 +226,7 @@ def report_used_poses(
 
 
 def report_equations(equations: int, parameters: int, method: Method) -> list[Finding]:
-    """Return how many directions are known from tolerances alone."""
+    """Return how many directions are known from spreads alone."""
     if equations >= parameters or not method.has_prior:
         return []
     return [
@@ -310,14 +310,14 @@ class Identification(DeferredFields, TableResult):
     ----------
     robot : Mechanism at the estimate. initial : the robot as it was given.
     options : of the fit, with the method that was used.
-    free_parameters : names, nominal values and tolerances.
+    free_parameters : names, nominal values and spreads.
     covariance : (p, p), infinite and NaN where the data do not determine a parameter.
     posterior : the same uncertainty by directions; accuracy of poses and a later prior use it.
     spectrum : singular values and rank. regularization : ridge parameter or truncation, with rule
         and score; None for other methods. unidentifiable : combinations that change no measured
         value.
     residual_test : the residuals against the noise.
-    prior_conflict : the stated tolerances against the data, where the method uses them; else None.
+    prior_conflict : the stated spreads against the data, where the method uses them; else None.
     residuals : of every kind. pose_weights : (n,) by the loss; 1 without one.
     history : status, steps and values of the iteration.
     nuisance : frames, targets, surfaces and offsets of the measurements.
@@ -592,7 +592,7 @@ class FitFigures:
         return draw(self._fit, "figure residuals")
 
     def parameters(self) -> Figure:
-        """Draw the shift of each parameter in tolerances with its 95 % interval."""
+        """Draw the shift of each parameter in spreads with its 95 % interval."""
         return draw(self._fit, "figure parameters")
 
     def correlation(self) -> Figure:
@@ -698,7 +698,7 @@ class NuisanceEstimate(TableResult):
     estimate : (U,).
     sd : standard deviations; infinite where the data do not determine the parameter, 0 where it is
         fixed, NaN without an interval.
-    slope : (U, p) change of the best values by the machine's deviations in tolerances.
+    slope : (U, p) change of the best values by the machine's deviations in spreads.
     root : square root (U, U + d) of their covariance at a known machine, empty without intervals;
         its last columns are the d directions that no row determines, with `UNDETERMINED`.
     is_unobservable : (U,) parameters with a part in a direction that no row determines, whatever

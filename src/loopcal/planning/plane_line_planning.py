@@ -167,7 +167,7 @@ class PlaneLineGroups(Limited):
     def linearize(self, design: FloatArray, checker: ConstraintChecker | None = None) -> FloatArray:
         """Return the rows (u, k - 2, p) of groups (u, c) for the machine, the surfaces eliminated.
 
-        They are divided by sigma, by deviations in tolerances; NaN for a group with a pose that is
+        They are divided by sigma, by deviations in spreads; NaN for a group with a pose that is
         out of reach or not allowed, too short a line, or points that do not determine the surfaces.
 
         checker : further constraints on the poses.
@@ -200,7 +200,7 @@ class PlaneLineGroups(Limited):
         self, x: FloatArray, checker: ConstraintChecker | None = None
     ) -> tuple[FloatArray, FloatArray, BoolArray]:
         """Return the origins (n, 3) of the tool [m], their derivatives (n, 3, p) by deviations in
-        tolerances, and which rows of x (n, c) are reached and allowed.
+        spreads, and which rows of x (n, c) are reached and allowed.
         """
         robot, free, values = self.robot, self.free, self.robot.values[None]
         solution = inverse(robot, x)
@@ -318,8 +318,8 @@ class SurfacePlan(DrawnResult):
     axis : (u,) 0, 1 or 2, along which each line runs.
     rank : number of parameter combinations that the groups determine.
     possible : number that planes and lines can determine. With fewer equations, the plan takes the
-        tolerances as prior information.
-    sd_first, sd_last : root mean square standard deviation of these, in tolerances, as drawn and as
+        spreads as prior information.
+    sd_first, sd_last : root mean square standard deviation of these, in spreads, as drawn and as
         planned.
     is_converged : whether moving points further gains hardly anything; False where the passes over
         the coordinates ran out.
@@ -456,7 +456,7 @@ def improve_groups(
     0 sweeps they stay.
 
     is_complete : whether so many groups determine all that such groups can determine; otherwise the
-        tolerances take part.
+        spreads take part.
     """
     count = len(groups.free)
     return coordinate_exchange(

@@ -107,7 +107,7 @@ class Stop:
 class DesignQuality:
     """Quality of the poses for the fit."""
 
-    figures: Mapping[str, float]  # D, I, A and E, in tolerances
+    figures: Mapping[str, float]  # D, I, A and E, in spreads
     # lower bound on the efficiency relative to the best possible choice: (ratio of
     # determinants)^(1/p) for D, ratio of variances for I
     efficiency: float

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Check the stated conventions of measurements against the robot, before anything is fitted.
 
-With the robot as given, unknown frames estimated and its parameters free within their tolerances,
+With the robot as given, unknown frames estimated and its parameters free within their spreads,
 whitened rows cost
 
     C = min_z |r + A z|^2 + |z|^2,    A = W G D diag(tolerance)
 
-which has a chi-square distribution with as many degrees of freedom as rows where tolerances and
+which has a chi-square distribution with as many degrees of freedom as rows where spreads and
 noise are true. The misfit sqrt(C / rows) is then 1, and at most k where all deviations are k
 tolerances large. A wrong unit, order, sign or column gives tens to millions. Only then are other
 interpretations of the data tested (`loopcal.diagnose.conventions.interpretations`), and the data
@@ -157,7 +157,7 @@ def compare_conventions(robot: Mechanism, data: Measurements) -> ConventionCheck
 
     Parameters
     ----------
-    robot : as given, before any fit: its values, and its tolerances (stated or default).
+    robot : as given, before any fit: its values, and its spreads (stated or default).
     data : as read. The `source` of its observations, such as a file, appears in the messages.
         Targets on the base are left out: they say nothing about the robot, and
         `loopcal.diagnose.measured_points.report_base_targets` compares them with each other.
@@ -348,7 +348,7 @@ def _compare_interpretations(
     }
     if chosen is not None and has_enough:
         interpretation, alternatives = chosen.interpretation, chosen.alternatives
-        # a robot far beyond its tolerances looks the same as an undeclared setup item
+        # a robot far beyond its spreads looks the same as an undeclared setup item
         is_doubtful = interpretation.slip == UNDECLARED and not misfit > GROSS
         finding = report_finding(
             "conventions.other-interpretation",

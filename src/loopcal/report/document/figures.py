@@ -242,7 +242,7 @@ def compute_accuracy(record: CalibrationRecord) -> AccuracyMap | str:
 
 @report_figure("parameters")
 def draw_parameter_picture(record: CalibrationRecord) -> Iterator[Element]:
-    """Yield shifts and uncertainties of the parameters in tolerances, and their correlations."""
+    """Yield shifts and uncertainties of the parameters in spreads, and their correlations."""
     rows = record.result["fit"]["parameters"]
     if not record.converged:
         return

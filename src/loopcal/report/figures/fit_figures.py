@@ -302,8 +302,8 @@ def draw_parameters(fit: Identification) -> Figure:
 def draw_parameter_rows(
     robot: str, rows: Sequence[Mapping[str, Any]], converged: bool = True
 ) -> Figure:
-    """Draw the shift of each parameter in tolerances with its 95 % interval, its uncertainty in
-    tolerances, and both as numbers in the unit of the robot's file.
+    """Draw the shift of each parameter in spreads with its 95 % interval, its uncertainty in
+    spreads, and both as numbers in the unit of the robot's file.
 
     Of a fit that did not converge only the last values are drawn, without intervals.
 
@@ -336,7 +336,7 @@ def draw_parameter_rows(
 
 
 def _draw_shifts(axes: Axes, rows: Sequence[Mapping[str, Any]], half: FloatArray) -> None:
-    """Draw estimate minus nominal value in tolerances, with the 95 % interval."""
+    """Draw estimate minus nominal value in spreads, with the 95 % interval."""
     shift = np.array([(row["estimate"] - row["nominal"]) / row["tolerance"] for row in rows])
     known, y = np.isfinite(half), np.arange(len(rows))
     axes.axvspan(-1.0, 1.0, color=PALE, alpha=0.35, lw=0.0, zorder=0)
@@ -351,7 +351,7 @@ def _draw_shifts(axes: Axes, rows: Sequence[Mapping[str, Any]], half: FloatArray
 def _draw_uncertainties(
     axes: Axes, rows: Sequence[Mapping[str, Any]], half: FloatArray, converged: bool
 ) -> None:
-    """Draw the half-width of the 95 % interval in tolerances; the numbers are at the right."""
+    """Draw the half-width of the 95 % interval in spreads; the numbers are at the right."""
     y, drawn = np.arange(len(rows)), np.isfinite(half) & (half > 0.0)
     axes.axvline(1.0, **DASHED, zorder=1)
     axes.plot(half[drawn], y[drawn], "s", color=WIDTH, ms=DOT)
@@ -424,13 +424,13 @@ def compute_correlation(covariance: FloatArray) -> FloatArray:
     return np.where(np.outer(usable, usable), covariance, np.nan) / np.outer(scale, scale)
 
 
-SMALLEST = 1e-16  # change in tolerances below which a number is rounding and drawn at this value
+SMALLEST = 1e-16  # change in spreads below which a number is rounding and drawn at this value
 
 
 @register("figure convergence", Identification)
 def draw_convergence(fit: Identification) -> Figure:
     """Draw the sum of squares, what noise alone would leave of it, and the distance of each
-    parameter from its last value in tolerances, by step of the iteration.
+    parameter from its last value in spreads, by step of the iteration.
     """
     figure, ((of_cost, of_parameters),) = start_panels(9.0, 3.9, 1, 2)
     cost, history = np.asarray(fit.history.cost), np.asarray(fit.history.estimate)
