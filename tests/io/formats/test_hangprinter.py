@@ -159,7 +159,7 @@ def test_keys_that_are_not_read_are_reported(tmp_path) -> None:
     assert "with 45 rows of motor angles" in notes
     for words in ("stiffness", "weight", "the unknown key 'colour'"):
         assert words in notes
-    assert "assumed 1 mm for lines" in notes
+    assert "Noise of a line: 1 mm (assumed)" in notes
 
 
 @pytest.mark.parametrize(

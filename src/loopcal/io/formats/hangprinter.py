@@ -176,6 +176,8 @@ def read(path: Path, options: ImportOptions) -> Imported:
         known=len(samples.known),
         sigma_line=Quantity(options.choose_noise("line") / MM, "mm"),
         sigma_position=Quantity(options.choose_noise("position") / MM, "mm"),
+        line_assumed=options.is_noise_assumed("line"),
+        position_assumed=options.is_noise_assumed("position"),
     )
     text = format_robot(samples, anchors, path, options)
     findings = [finding]

@@ -197,6 +197,8 @@ def read(path: Path, options: ImportOptions) -> Imported:
         distances=len(distances),
         sigma_height=Quantity(options.choose_noise("height") / MM, "mm"),
         sigma_distance=Quantity(options.choose_noise("distance") / MM, "mm"),
+        height_assumed=options.is_noise_assumed("height"),
+        distance_assumed=bool(distances) and options.is_noise_assumed("distance"),
     )
     labels = tuple(positions)
     rows = [labels.index(record) for record in heights]
