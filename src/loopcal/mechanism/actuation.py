@@ -285,17 +285,6 @@ def differentiate_driven_joints(robot: Mechanism, values: FloatArray, q: FloatAr
         return np.matmul(invert_weights(weights), np.concatenate(moved, axis=3))
 
 
-def differentiate_joints_by_readings(
-    robot: Mechanism, values: FloatArray, q: FloatArray
-) -> FloatArray:
-    """Return d joint / d reading (t | 1, n | 1, J, a) of as many readings as joints."""
-    _, tau = robot.slots(values)
-    weights = select_weights(tau, robot.slots.constants)
-    assert weights is not None
-    by_readings = differentiate_by_readings(q, tau, robot.slots.constants)
-    return np.matmul(invert_weights(weights)[:, None], by_readings)
-
-
 def _differentiate_sums(
     robot: Mechanism, values: FloatArray, q: FloatArray, lengths: FloatArray
 ) -> tuple[FloatArray, Derivatives]:

@@ -23,7 +23,6 @@ from loopcal.mechanism.actuation import (
     Derivatives,
     DrivenJoints,
     differentiate_driven_joints,
-    differentiate_joints_by_readings,
     differentiate_open_sums,
     differentiate_unknowns_by_sums,
     drive_joints,
@@ -70,7 +69,8 @@ def differentiate_pose(
             given = robot.program, e, joints, state, inputs, nodes
             by_parameters, turned = engine.differentiate(*given)
             if robot.has_sums:
-                turned = np.matmul(turned, differentiate_joints_by_readings(robot, values, q))
+                by_inputs = differentiate_driven_joints(robot, values, q)
+                turned = np.matmul(turned, by_inputs[..., len(robot.parameters) :])
         derivatives = [by_parameters, turned]
     is_open = find_open_loops(robot, state)
     if is_open.any():

@@ -287,10 +287,7 @@ def list_coordinates(
     limbs = split_joints(program, flat)
     for group, joints, theta in zip(program.groups, start.joints, limbs, strict=True):
         values = theta.reshape(*theta.shape[:2], *shape)
-        values[:] = joints.transpose(3, 2, 0, 1)
-        for j, columns in enumerate(group.actuator):
-            if columns[0] >= 0:
-                values[j] = q[:, :, columns].transpose(2, 0, 1)
+        values[:] = group.insert_driven(joints, q).transpose(3, 2, 0, 1)
     return flat
 
 
