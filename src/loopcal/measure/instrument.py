@@ -224,7 +224,7 @@ class Instrument:
     """The sensors, at least one, that measure every pose.
 
     stated_values : priors of its setup parameters, such as a scale of 2 ppm:
-        `StatedValue("position.scale", sd=2e-6)`. A simulation draws the true values from them.
+    `StatedValue("position.scale", sd=2e-6)`. A simulation draws the true values from them.
     has_stations : whether the sensors are stations of one, of which a plan chooses one for a pose.
     """
 
