@@ -471,7 +471,7 @@ class _Machine(NamedTuple):
     corrected: list[int]
 
     def lead(self, targets: FloatArray, commands: FloatArray) -> FloatArray:
-        """Return how far (n, c) the robot stops from targets at commands (n, c), NaN unreached."""
+        """Return how far (n, c) from targets the robot stops at commands (n, c), or NaN."""
         led = inverse(self.controller, commands)
         readings = np.where(led.converged[:, None], led.q, np.nan)
         return self.stop(targets, readings[:, list_commanded(self.controller)])

@@ -92,7 +92,7 @@ class PairComparison:
     __repr__ = represent
 
     def find_shift(self, name: str) -> tuple[float, float, bool]:
-        """Return a parameter's shift, its sd [SI], and whether it is significant; NaN untested."""
+        """Return a parameter's shift, its sd [SI], and whether it is significant, or NaN."""
         if name not in self.names:
             return math.nan, math.nan, False
         i = self.names.index(name)

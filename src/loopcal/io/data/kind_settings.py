@@ -896,7 +896,7 @@ def _select_rows(table: Table, entry: KindRows, members: Sequence[tuple[int, ...
 def _read_values(
     table: Table, robot: Mechanism, entry: KindRows
 ) -> tuple[FloatArray, FloatArray, tuple[NoisePart, ...]]:
-    """Return measured values (r, c), the covariance (r, m, m) of residuals [SI], stated parts."""
+    """Return measured values (r, c), the covariance (r, m, m) of residuals [SI] and its parts."""
     kind, rows = entry.kind, entry.rows
     known = list_columns(robot, [kind])
     names = [name_measured(column.name, robot) for column in kind.columns]

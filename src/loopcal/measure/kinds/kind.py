@@ -371,7 +371,7 @@ class Kind(ABC):
 
     @cached_property
     def common_errors(self) -> Mapping[int, str]:
-        """Place among the u parameters -> common error of the instrument, as `tracker.bias`."""
+        """Place among the u parameters -> common error of the instrument: `tracker.bias`."""
         return {
             i: name_shared_error(self, item, "").rstrip(".")
             for item in self.shared_errors
