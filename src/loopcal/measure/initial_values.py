@@ -374,8 +374,8 @@ def _refine_candidates(
         cost = sum_squares(whiten(candidates, sets)[0]).reshape(t * g, k)
         chosen = (np.argsort(cost, axis=1)[:, :most] + k * np.arange(t * g)[:, None]).ravel()
         candidates, sets, k = candidates[chosen], sets[chosen], most
-    worth = np.inf
-    if kind.guesses_minima and not kind.shared_errors and not kept.any():
+    worth, is_plain = np.inf, not (kind.is_of_base or kind.shared_errors or kept.any())
+    if is_plain and isinstance(kind, Position) and {"frame", "targets"} <= set(kind.unknown):
         # minima for equal noise: each is left where another one is lower for any other noise, too
         size = np.abs(np.einsum("...mm->...m", whitener))
         if np.count_nonzero(size) == np.count_nonzero(whitener):

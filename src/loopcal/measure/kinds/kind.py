@@ -514,13 +514,6 @@ class Kind(ABC):
         """
         return self.nominal_values[None]
 
-    @property
-    def guesses_minima(self) -> bool:
-        """Whether the candidates of `guess_values` are the lowest minima of the sum of squares, for
-        residuals of equal noise.
-        """
-        return False
-
     def guess_sets(
         self, T: FloatArray, measured: FloatArray, is_row: BoolArray
     ) -> list[FloatArray | DataError]:

@@ -366,11 +366,6 @@ class Position(TargetKind):
         )
 
     @property
-    def guesses_minima(self) -> bool:
-        """Whether frame and targets are found together."""
-        return not self.is_of_base and {"frame", "targets"} <= set(self.unknown)
-
-    @property
     def locates_frame(self) -> bool:
         """Whether targets at stated places on the base determine the frame: not on a line."""
         if not self.is_of_base or self.places is None or "frame" not in self.unknown:
