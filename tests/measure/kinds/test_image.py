@@ -105,6 +105,23 @@ def test_camera_alone_is_calibrated_within_its_stated_uncertainty() -> None:
     assert np.mean(np.square(errors)) == pytest.approx(1.0, abs=0.5)
 
 
+def test_board_that_never_turns_leaves_the_center_in_the_middle() -> None:
+    """As on a delta or five-bar: such pictures determine no center, whatever fits them best."""
+    kind = Image(focal=(3150.0, 3150.0), unknown=Image.allowed_unknown[:6], corners=(9, 6))
+    corner = np.tile(np.arange(54.0), 12)[:, None]
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        R = geometry.exp_so3(np.array([rng.uniform(0.4, 0.7), rng.uniform(-0.3, 0.3), 0.0]))
+        t = rng.uniform([-0.15, -0.1, 0.4], [-0.05, 0.0, 0.6], (12, 3))
+        pixels = np.array([[project_by_hand(R @ p + at, LENS_VALUES) for p in BOARD] for at in t])
+        noisy = (pixels + rng.normal(size=pixels.shape)).reshape(-1, 2)  # and errors of a machine
+        T = np.repeat(geometry.make_pose(np.eye(3), t), 54, axis=0)
+        guesses = kind.guess_values(T, np.hstack([corner, noisy]))
+        names = [parameter.name for parameter in kind.nuisance_parameters]
+        center = guesses[:, [names.index("camera.cx"), names.index("camera.cy")]]
+        assert np.abs(center - [1999.5, 1499.5]).max() < 300.0  # [px]
+
+
 def test_pictures_with_too_few_corners_are_refused() -> None:
     _, pixels = draw_pictures(3)
     pixels[1, 9:] = np.nan  # a row of corners: on a line

@@ -48,6 +48,7 @@ ROUNDING = 1e-12  # relative increase of a sum of squares that is none
 LENS_ITEMS: Mapping[str, tuple[str, ...]] = {
     "focal": LENS[:2], "center": LENS[2:4], "radial": LENS[4:7], "tangential": LENS[7:],
 }  # fmt: skip
+VAGUE = (*LENS_ITEMS["center"], *LENS_ITEMS["tangential"])  # what pictures may leave anywhere
 PRINT, BEND = ("scale_x", "scale_y"), ("bend_x", "bend_y", "bend_xy")
 PICTURES = 40  # pictures, evenly chosen, of which start values are made
 # Standard deviations of what nobody measured: a center as a share of the width, a scale of a print,
@@ -637,6 +638,8 @@ class Image(Kind):
                 found.append((closed, locate_boards(points, pixels, closed)))
         for start in starts:
             fit = calibrate_camera(points, pixels, start, free)
+            if not (fit.sd[2:4] < CENTER_SD * max(self.size)).all():  # as if a board never turns
+                fit = calibrate_camera(points, pixels, start, free & ~np.isin(LENS, VAGUE))
             # pictures that do not determine a lens leave it anywhere
             if np.isfinite(fit.lens).all() and fit.lens[:2].min() > 0.0:
                 found.append((fit.lens, fit.poses))
