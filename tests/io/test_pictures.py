@@ -113,18 +113,21 @@ def test_files_that_are_no_pictures_are_named(tmp_path) -> None:
     assert len(list_pictures(tmp_path)) == 4
 
 
-def test_other_sizes_and_other_zooms_are_left_out(tmp_path) -> None:
-    picture = render(BOARD, place("straight"), LENS, SIZE)
-    paths = [save(tmp_path, picture, f"{i}.jpg", 26) for i in range(3)]
-    paths.append(save(tmp_path, picture, "zoom.jpg", 52))
-    paths.append(save(tmp_path, np.ascontiguousarray(picture[:700]), "crop.jpg", 26))
+def test_other_sizes_other_zooms_and_copies_are_left_out(tmp_path) -> None:
+    pictures = [render(BOARD, place("straight"), LENS, SIZE, seed=i) for i in range(5)]
+    paths = [save(tmp_path, pictures[i], f"{i}.jpg", 26) for i in range(3)]
+    paths.append(save(tmp_path, pictures[3], "zoom.jpg", 52))
+    paths.append(save(tmp_path, np.ascontiguousarray(pictures[4][:700]), "crop.jpg", 26))
+    paths.append(save(tmp_path, pictures[1], "copy.jpg", 26))
     found = compare_pictures([examine(path) for path in paths])
     codes = [None if p.fault is None else p.fault.code for p in found]
-    assert codes == [None, None, None, "pictures.zoomed", "pictures.other-size"]
+    others = ["pictures.zoomed", "pictures.other-size", "pictures.repeated"]
+    assert codes == [None, None, None, *others]
+    assert found[-1].fault.data["other"] == "1.jpg"
     assert found[0].focal == pytest.approx(26.0 / 43.27 * 1250.0, rel=1e-3)
     names = dict.fromkeys(paths, "<b>")
     page = format_contact_sheet(found, names)
-    assert page.count("<img") == 5
+    assert page.count("<img") == 6
     assert "<b><b>" not in page
     assert "http" not in page
     with pytest.raises(DataError, match="no residuals of these pictures"):

@@ -485,19 +485,24 @@ def measure_blur(cv2: Any, gray: Any, board: Board, corners: IntArray, pixels: F
 
 
 def compare_pictures(pictures: Sequence[Picture]) -> tuple[Picture, ...]:
-    """Return pictures, without those of another size or focal length than most have."""
+    """Return pictures, without those of another size or focal length than most have, and without
+    a file that is another one once more.
+    """
     good = [picture for picture in pictures if picture.fault is None]
     if not good:
         return tuple(pictures)
     size = Counter(picture.size for picture in good).most_common(1)[0][0]
     focals = [p.focal for p in good if p.focal is not None and p.size == size]
     focal = float(np.median(focals)) if focals else None
-    checked = []
+    checked, first = [], dict[bytes, Picture]()
     for picture in pictures:
         fault = picture.fault
+        earlier = first.setdefault(picture.pixels.tobytes() if fault is None else b"", picture)
         if fault is None and picture.size != size:
             sizes = [f"{width} x {height}" for width, height in (picture.size, size)]
             fault = report_finding("pictures.other-size", size=sizes[0], other=sizes[1])
+        elif fault is None and earlier is not picture:
+            fault = report_finding("pictures.repeated", other=earlier.path.name)
         elif fault is None and focal is not None:
             own = picture.focal or focal
             if abs(own / focal - 1.0) > SAME_FOCAL:
