@@ -85,8 +85,9 @@ class OpenSums:
 
     def join(self, chosen: FloatArray) -> FloatArray:
         """Return all sums (t, n, r) of those of commanded readings."""
-        fixed = np.broadcast_to(self.fixed, (*chosen.shape[:2], self.fixed.shape[2]))
-        return np.concatenate([chosen, fixed], axis=2)
+        lead = np.broadcast_shapes(chosen.shape[:2], self.fixed.shape[:2])
+        parts = (np.broadcast_to(a, (*lead, a.shape[2])) for a in (chosen, self.fixed))
+        return np.concatenate([*parts], axis=2)
 
     def read(self, joints: FloatArray) -> FloatArray:
         """Return the sums (t, n, chosen) of joint values (t, n, J)."""
