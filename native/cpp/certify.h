@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// Whether Newton's method from a start provably converges to known solutions; see certificate.py,
-// whose words are used here.
+// Whether Newton's method from a start provably converges to known solutions: the proof is that of
+// docs/theory/kinematics.md, whose words are used here.
 #pragma once
 
 #include "rods.h"
@@ -37,7 +37,7 @@ inline double square_norm(const double (&C)[6][6]) {
     return norm;
 }
 
-// The start of one trial: `Begin` of certificate.py.
+// The start of one trial.
 struct Begin {
     double T[12], tip[6][3], attachment[6][3], distance[6], inverse[6][6], swing[6], bend[3], unit,
         sign;
@@ -63,7 +63,7 @@ struct Begin {
             column[k] = splat(-1.0);
             factor.solve(column, y);
             distance[k] = factor.distance[k][0];
-            // a turn is measured by `unit`, see certificate.py
+            // a turn is measured by `unit`, the length by which it becomes a displacement
             for (int i = 0; i < 6; i++) {
                 int f = program.freedom[i];
                 inverse[f][k] = f < 3 ? y[i][0] * unit : y[i][0];

@@ -29,7 +29,6 @@ from loopcal.engine import (
     Task,
     TwistRows,
 )
-from loopcal.engine.numpy_engine.certificate import has_driven_rods
 from loopcal.engine.numpy_engine.sensitivity import differentiate as differentiate_nodes
 from loopcal.engine.numpy_engine.targets import reach_by
 from loopcal.typing import BoolArray, FloatArray
@@ -525,6 +524,19 @@ class NativeFunctions:
             call = load_library().loopcal_compare_poses
             require_done(call(self.instruction_set, describe_all(arrays), *addresses, t, n))
         return residual, by_twist
+
+
+def has_driven_rods(program: Program) -> bool:
+    """Return whether the mechanism has six freedoms and six limbs, each a driven rod alone."""
+    return (
+        len(program.freedoms) == 6
+        and not program.others
+        and sum(len(group.limbs) for group in program.groups) == 6
+        and all(
+            g.ending == "distance" and not g.joints and g.actuator[0, 0] >= 0
+            for g in program.groups
+        )
+    )
 
 
 def is_closed_at_once(program: Program) -> bool:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Close the loops at target poses, and find which of them the start's mode reaches.
 
-A pose is reached where the certificate proves it, or where its sign is the start's and Newton's
+A pose is reached where a certificate proves it, or where its sign is the start's and Newton's
 method from the start comes close to it, see newton.py.
 """
 
@@ -19,7 +19,7 @@ from loopcal.typing import FloatArray
 
 def reach_by(
     solve: Callable[..., State],
-    certify: Callable[..., NDArray[np.int8]],
+    certify: Callable[..., NDArray[np.int8]] | None,
     program: Program,
     e: FloatArray,
     target: Target,
@@ -30,7 +30,9 @@ def reach_by(
     state = solve(limbs, e, program.list_drives(start.joints), first, free=True)
     q = program.list_drives(state.joints)
     sign = solve(program, e, q, state, max_iterations=0).closure_sign
-    proven = certify(program, e, start, state) != 0
+    proven = np.zeros(q.shape[:2], bool)
+    if certify is not None:
+        proven = certify(program, e, start, state) != 0
     open_rows = ~proven & (sign == start.closure_sign) & (state.status == CONVERGED)
     # other rows end at once
     back = solve(program, e, np.where(open_rows[..., None], q, np.nan), start, goal=state)
