@@ -72,8 +72,8 @@ def test_page_opens_without_requests_errors_and_javascript(browser, page) -> Non
     assert asked == [page.as_uri()]
     assert logged == []
     assert tab.locator("h2").count() == 12
-    assert tab.locator("figure > svg").count() == 7
-    for i in range(6):
+    assert tab.locator("figure > svg").count() == 8
+    for i in range(7):
         box = tab.locator("figure > svg").nth(i).bounding_box()
         assert box["width"] > 300.0
         assert box["height"] > 150.0

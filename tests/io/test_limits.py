@@ -239,6 +239,7 @@ COUNTED = {
     "FOLDS": ("regularize linear-delta d.csv --folds",),
     "REPLICATES": ("study extend results --replicates",),
     "WORKERS": ("study run s.yaml -o results --workers", "study extend results --workers"),
+    "STATIONS": ("plan linear-delta -o p --measure camera --stations",),
     "SQUARES": ("board -o board.yaml --columns", "board -o board.yaml --rows"),
 }
 

@@ -242,7 +242,9 @@ def test_unknown_target_is_a_misfit_with_its_line(robot, sheet, points, tmp_path
 
 def test_inches_without_the_unit_are_refused(robot, sheet, points, tmp_path) -> None:
     export = write_spatial_analyzer(tmp_path / "e.txt", points, scale=1 / 25.4)
-    with pytest.raises(DataError, match=r"unit mm, but the points fit .* the unit in "):
+    with pytest.raises(
+        DataError, match=r"the unit `mm`, but with the unit `in` the points are closer"
+    ):
         examine(robot, sheet, export)
 
 

@@ -449,7 +449,8 @@ class NativeFunctions:
         k, arrays = points.shape[2], [as_reals(T), None if frame is None else as_reals(frame)]
         arrays.append(as_reals(points).reshape(*points.shape[:2], 3 * k))
         shapes = [a.shape[:2] for a in arrays if a is not None]
-        t, n = shape = max(s[0] for s in shapes), max(s[1] for s in shapes)
+        t, n = (0 if 0 in sizes else max(sizes) for sizes in zip(*shapes, strict=True))
+        shape = t, n
         ends = ("poses", (4, 4)), ("frames", (6,)), ("points", (3 * k,))
         for (name, end), array in zip(ends, arrays, strict=True):
             if array is not None:

@@ -114,7 +114,12 @@ def describe_blocks(
         is_right = columns.shape == (k, c) and part.by_unknowns.shape == (t, k, m, c)
         require(is_right and _is_within(columns, w + 1), f"columns ({k}, c) of {w}")
         rows_of = [_collapse(a) for a in (part.by_unknowns, part.machine)]
-        strided = (Strided(a.ctypes.data, a.strides[0] // 8, a.strides[2] // 8) for a in rows_of)
+        # strides along an axis of length one are arbitrary
+        between = [a.strides[2 if m > 1 else 1] // 8 for a in rows_of]
+        strided = (
+            Strided(a.ctypes.data, a.strides[0] // 8, step)
+            for a, step in zip(rows_of, between, strict=True)
+        )
         parts.append(
             RowsOfLibrary(part.structure, k, m, c, locate(place), locate(columns), *strided)
         )
@@ -125,9 +130,9 @@ def describe_blocks(
 
 def _collapse(rows: FloatArray) -> FloatArray:
     """Return rows (t, k, m, c) that are all as far apart in memory, a copy where they are not."""
-    _, step, between, number = rows.strides
-    is_even = number == 8 and step == rows.shape[2] * between and rows.dtype == np.float64
-    return rows if is_even else as_reals(rows)
+    (_, k, m, c), (_, step, between, number) = rows.shape, rows.strides
+    is_even = (number == 8 or c == 1) and (step == m * between or k == 1 or m == 1)
+    return rows if is_even and rows.dtype == np.float64 else as_reals(rows)
 
 
 def _is_within(numbers: IntArray, count: int) -> bool:

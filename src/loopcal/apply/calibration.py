@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -37,7 +37,6 @@ from loopcal.diagnose.adjusted_uncertainty import (
     is_explainable,
 )
 from loopcal.diagnose.conventions.convention_check import ConventionCheck, check_conventions
-from loopcal.diagnose.cross_validation import ModelChoice, choose_model
 from loopcal.diagnose.error_causes import (
     explain_residuals,
     find_print_scale,
@@ -89,6 +88,9 @@ from loopcal.measure.readings import fill_in_reading_sigma
 from loopcal.mechanism.model import Mechanism
 from loopcal.results.deferred import later
 from loopcal.typing import Progress, StepCounter, report_no_progress
+
+if TYPE_CHECKING:
+    from loopcal.diagnose.cross_validation import ModelChoice
 
 # Codes of data that a geometry cannot reach.
 OUT_OF_REACH = ("residuals.poses-out-of-reach", "residuals.calibrated-out-of-reach")
@@ -265,6 +267,8 @@ def _fit(
         return fit, None, change
     choice = None
     if options.choose_model:
+        from loopcal.diagnose.cross_validation import choose_model
+
         choice = choose_model(robot, data, options=fit_options, progress=count.progress)
         if not choice.chosen.parameters:
             left_out = choice.finding.data["not_compared"]

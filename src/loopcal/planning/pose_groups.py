@@ -169,7 +169,7 @@ def linearize_groups(
     stated = nuisance.table.free & ~np.isnan(nuisance.table.tolerance)
     weight = np.where(stated, 1.0 / np.where(stated, nuisance.table.tolerance, 1.0), 0.0)
     rows = np.concatenate(blocks, axis=1)
-    stations, rows = len(rows), rows.reshape(-1, *rows.shape[2:])
+    stations, rows = len(rows), rows.reshape(len(rows) * len(members), *rows.shape[2:])
     prior = np.zeros((len(nuisance), rows.shape[2]))
     prior[:, : len(nuisance)] = np.diag(weight)
     prior = np.concatenate([prior, _linearize_base(mounted, nuisance, rows.shape[2])])

@@ -70,6 +70,26 @@ def test_blocks_are_eliminated_as_in_numpy(open_trial):
 
 
 @pytest.mark.parametrize("t", [1, 3])
+def test_priors_of_one_row_each_are_read_where_their_memory_has_other_steps(t):
+    """Along an axis of length one the step in memory is arbitrary: an array with new axes has 0."""
+    rng, results = np.random.default_rng(4), []
+    scopes, sizes = ["session"] * 6, rng.uniform(1.0, 9.0, 6)
+    tree = build_tree(np.ones(6, dtype=bool), scopes, np.array([(i, i) for i in range(6)]))
+    node, unknown = tree.node, np.arange(6)
+    machine = rng.normal(size=(t, 6, 1, P + 1))
+    view = np.broadcast_to(sizes[:, None, None], (t, 6, 1, 1))
+    for rows in (view, view.tolist()):
+        factors, columns = NodeFactors(tree, t, P), tree.column[unknown][:, None]
+        places = int(tree.structure[node[0]]), tree.place[node], columns
+        factors.add(BlockRows(*places, np.asarray(rows), machine))
+        with use_engine("native"):
+            results.append(list_results(factors))
+    for mine, expected in zip(*results, strict=True):
+        assert_array_equal(mine, expected)
+    assert_allclose(results[0][3], np.ones((t, 6)))  # variances over lengths
+
+
+@pytest.mark.parametrize("t", [1, 3])
 def test_blocks_have_the_same_bits_for_every_instruction_set_and_alone(t):
     factors = draw_rows(t)
     shape = t, len(factors.tree.node), P

@@ -587,9 +587,12 @@ class Kind(ABC):
             # Derivatives by the place of a target cancel between parallel poses: what is rounding
             # beside the derivative by the twist is zero. Radians count as moves of the largest
             # distance from the base, whatever the size of a machine.
-            reach = float(np.abs(T[..., :3, 3]).max(initial=0.0))
-            reach = reach if reach > 0.0 else 1.0
-            by_move = np.sqrt(result.jacobian**2 @ np.repeat([reach**-2, 1.0], 3))
+            reach = np.abs(T[..., :3, 3]).max(initial=0.0)
+            reach = np.where(reach > 0.0, reach, 1.0)
+            square = result.jacobian**2
+            by_move = np.sqrt(
+                square[..., :3].sum(axis=-1) / reach**2 + square[..., 3:].sum(axis=-1)
+            )
             by_move = by_move.sum(axis=-2) if self.poses_per_row > 1 else by_move
             size = by_move[..., None] * np.where(np.array(self._is_length), 1.0, reach)
             result = result._replace(nuisance=without_rounding(result.nuisance, size))

@@ -180,7 +180,7 @@ class TargetKind(Kind):
         k = len(self.targets)
         of_frame, places = (self.item_values(values, name) for name in ("frame", "targets"))
         p = self._stated_places() if places is None else places.reshape(*places.shape[:-1], k, 3)
-        if T.ndim == 4 and values.ndim == 3:
+        if isinstance(T, np.ndarray) and T.ndim == 4 and values.ndim == 3:  # no jax in tests
             points = p if p.ndim == 4 else p[None, None]
             given = drop_repeats(T), self.T_base_frame, of_frame, points, self._columns
             if (located := engine.locate_points(*given)) is not None:
