@@ -244,6 +244,10 @@ class NodeFactors:
     tree : of the U unknowns. trials : a. parameters : p of the machine.
     """
 
+    tree: EliminationTree
+    trials: int
+    parameters: int
+
     def __init__(self, tree: EliminationTree, trials: int, parameters: int) -> None:
         self.tree, self.trials, self.parameters = tree, trials, parameters
         self._factors: list[FloatArray] = [

@@ -122,6 +122,22 @@ class Chain:
     `direction` and `moment`.
     """
 
+    group: Group
+    links: PlacedLinks
+    theta: FloatArray
+    size: float
+    last: int
+    carrier: FloatArray | None
+    before: list[FloatArray | None]
+    axes: list[FloatArray]
+    origins: list[FloatArray]
+    platform: FloatArray
+    tip: FloatArray
+    tip_rotation: FloatArray
+    arm: FloatArray
+    gap: FloatArray
+    distance: FloatArray
+
     def __init__(
         self, group: Group, links: PlacedLinks, bodies: FloatArray, theta: FloatArray, size: float
     ) -> None:
@@ -129,13 +145,13 @@ class Chain:
         self.last = len(group.joints) + 1
         # rotation before each link, axis of each joint, origin behind each link
         rotation, point = links.rotation[0], links.origin[0]
-        self.carrier: FloatArray | None = None
+        self.carrier = None
         if group.on[0] != BASE:
             self.carrier = carrier = _select_bodies(bodies, group.on)
             rotation = matmul(carrier[:, :3], rotation)
             point = matvec(carrier[:, :3], point) + carrier[:, 3]
         before = None if self.carrier is None else self.carrier[:, :3]
-        self.before: list[FloatArray | None] = [before]
+        self.before = [before]
         self.axes, self.origins = list[FloatArray](), [point]
         for j, letter in enumerate(group.joints):
             axis, value = rotation[:, 2], theta[j]
