@@ -67,7 +67,9 @@ def write_files(
     exif.get_ifd(0x8769)[0xA405] = FILM
     for i, (q, at) in enumerate(zip(scene.q, scene.x, strict=True)):
         seen = scene.locate_board(machine, at)
-        picture = render(board, seen, scene.lens, SIZE, seed=i, scale=scale, blur=0.5, fine=1)
+        picture = render(
+            board, seen, scene.lens, SIZE, seed=i, scale=tuple(scale), blur=0.5, fine=1
+        )
         Picture.fromarray(picture).save(folder / "pictures" / f"p{i}.jpg", quality=95, exif=exif)
         lines.append(",".join([f"p{i}", *(f"{value:.12g}" for value in q)]))
     (folder / "poses.csv").write_text("\n".join(lines) + "\n")
@@ -92,7 +94,7 @@ def examine_machine(name: str, seed: int) -> tuple[Outcome, float, float]:
     (rows,) = data.observations
     poses = [int(data.labels[i][1:]) for i in rows.rows]
     seen = [scene.locate_board(machine, at) for at in pictured.x]
-    true = np.array([project_corners(board, T, scene.lens, scale) for T in seen])
+    true = np.array([project_corners(board, T, scene.lens, tuple(scale)) for T in seen])
     errors = rows.measured[:, 1:] - true[poses, rows.measured[:, 0].astype(int)]
     rest = scene.q[POSES:], scene.x[POSES:]
     outcome = judge(machine, Sample(data, scene.truth, *rest, name_lens(scene.lens)))

@@ -125,6 +125,7 @@ def test_standard_deviations_equal_those_of_the_joint_problem(stated):
     rows = observe_rows(at, data, local, fit.nuisance.estimate)[0, :, :-1]
     scale = np.linalg.norm(rows, axis=0)
     by_rows, by_prior = (rows / scale).T @ (rows / scale), np.zeros(len(scale))
+    assert options.nuisance is not None
     tolerance = options.nuisance.table.tolerance
     by_prior[: len(local)] = np.where(np.isnan(tolerance), 0.0, tolerance**-2.0)
     by_prior = np.diag(by_prior / scale**2)

@@ -164,7 +164,7 @@ def test_proofs_agree_between_instruction_sets(name, t, n):
     case = make_robot_case(name, t, n)
     goal = NUMPY.solve(case.program, case.e, case.q, case.home)
     arguments = case.program, case.e, case.home, goal
-    proven = [e.certify(*arguments) for e in ENGINES.values()]
+    proven = [e.certify(*arguments) for e in ENGINES.values() if e.certify is not None]
     assert (proven[0] != 0).any()
     for other in proven[1:]:
         assert_array_equal(other, proven[0])

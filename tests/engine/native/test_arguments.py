@@ -124,6 +124,7 @@ RODS_GOAL = NATIVE.solve(RODS.program, RODS.e, RODS.q, RODS.home)
 )
 def test_starts_and_goals_of_wrong_shape_are_refused(e, start, goal):
     begin, end = replace(RODS.home, T=start), replace(RODS_GOAL, T=goal)
+    assert NATIVE.certify is not None
     with pytest.raises((ValueError, IndexError)):
         NATIVE.certify(RODS.program, e, begin, end)
 
@@ -284,6 +285,7 @@ def check_any_numbers(native: Engine, name: str, rows: int, seed: int) -> int:
     closed = state.status == CONVERGED
     assert np.isfinite(state.T[closed]).all()
     assert set(np.unique(state.status)) <= {0, 1, 2, 3}
+    assert native.certify is not None
     sign = native.certify(case.program, e, case.home, state)
     assert set(np.unique(sign)) <= {-1, 0, 1}
     target = Target(disturb(rng, np.zeros((rows, 2, 6)), share), tuple(range(6)), False, np.eye(4))
