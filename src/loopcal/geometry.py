@@ -67,6 +67,14 @@ def hat(vector: FloatArray) -> FloatArray:
     return np.reshape(np.matmul(vector, _HAT), (*vector.shape, 3))
 
 
+def find_perpendicular(axis: FloatArray, near: FloatArray) -> FloatArray:
+    """Return the unit vector (3,) across an axis that is nearest to another vector."""
+    across = near - axis * (axis @ near)
+    if np.linalg.norm(across) < 1e-6:
+        across = np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
+    return np.asarray(across / np.linalg.norm(across), dtype=np.float64)
+
+
 def _polynomial(vector: FloatArray, first: FloatArray | float, second: FloatArray) -> FloatArray:
     """Return `I + first hat(w) + second hat(w)^2`.
 

@@ -482,21 +482,18 @@ class NativeFunctions:
             ((t,), np.bool_),
         )
         values[:] = 0.0  # of unknowns without a block
-        call, addresses = (
-            load_library().loopcal_eliminate_blocks,
-            (factor, values, length, explained),
-        )
-        outcome = call(
+        results = factor, values, length, explained, is_regular
+        outcome = load_library().loopcal_eliminate_blocks(
             self.instruction_set,
             blocks.structures,
             len(structures),
             blocks.rows,
             len(rows),
             *(t, U, q, limit),
-            *(locate(a) for a in (*addresses, is_regular)),
+            *(locate(a) for a in results),
         )
         require_done(outcome)
-        return EliminatedBlocks(*addresses, is_regular, blocks.solutions)
+        return EliminatedBlocks(*results, blocks.solutions)
 
     def solve_triangles(
         self, triangle: FloatArray, right: FloatArray

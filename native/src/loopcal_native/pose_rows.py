@@ -108,18 +108,13 @@ def describe_blocks(
         place, columns = (np.ascontiguousarray(a, np.int64) for a in part[1:3])
         require(part.machine.ndim == 4 and columns.ndim == 2, "rows (t, k, m, p + 1)")
         (_, k, m, _), c = part.machine.shape, columns.shape[1]
-        shape = part.machine.shape
-        require(shape == (t, k, m, q), f"rows ({t}, k, m, {q}), not {shape}")
+        is_right = part.machine.shape == (t, k, m, q)
+        require(is_right, f"rows ({t}, k, m, {q}), not {part.machine.shape}")
         require(place.shape == (k,) and _is_within(place, n), f"places ({k},) of {n} blocks")
         is_right = columns.shape == (k, c) and part.by_unknowns.shape == (t, k, m, c)
         require(is_right and _is_within(columns, w + 1), f"columns ({k}, c) of {w}")
-        rows_of = [_collapse(a) for a in (part.by_unknowns, part.machine)]
-        # strides along an axis of length one are arbitrary
-        between = [a.strides[2 if m > 1 else 1] // 8 for a in rows_of]
-        strided = (
-            Strided(a.ctypes.data, a.strides[0] // 8, step)
-            for a, step in zip(rows_of, between, strict=True)
-        )
+        rows_of = [_join_sets(a) for a in (part.by_unknowns, part.machine)]
+        strided = (Strided(a.ctypes.data, *(step // 8 for step in a.strides[:2])) for a in rows_of)
         parts.append(
             RowsOfLibrary(part.structure, k, m, c, locate(place), locate(columns), *strided)
         )
@@ -128,11 +123,14 @@ def describe_blocks(
     return FlatBlocks(structures_of_library, (RowsOfLibrary * len(parts))(*parts), solutions, kept)
 
 
-def _collapse(rows: FloatArray) -> FloatArray:
-    """Return rows (t, k, m, c) that are all as far apart in memory, a copy where they are not."""
-    (_, k, m, c), (_, step, between, number) = rows.shape, rows.strides
-    is_even = (number == 8 or c == 1) and (step == m * between or k == 1 or m == 1)
-    return rows if is_even and rows.dtype == np.float64 else as_reals(rows)
+def _join_sets(rows: FloatArray) -> FloatArray:
+    """Return rows (t, k m, c) of k sets of m, each without gaps; a copy only where they have some.
+
+    NumPy finds the step between rows: along an axis of length one, that of `rows` is arbitrary.
+    """
+    t, k, m, c = rows.shape
+    joined = rows.reshape(t, k * m, c)
+    return joined if joined.strides[2] == 8 and joined.dtype == np.float64 else as_reals(joined)
 
 
 def _is_within(numbers: IntArray, count: int) -> bool:

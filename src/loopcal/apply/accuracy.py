@@ -331,7 +331,7 @@ class AccuracyMap(DrawnResult):
 
     @property
     def position_ratio(self) -> FloatArray:
-        """(n,) position uncertainty divided by the largest at the measured poses."""
+        """(n,) uncertainty over the largest one at measured poses; above 1 the map extrapolates."""
         return _ratio(self.uncertainty.position, self.measured.position)
 
     @property

@@ -48,11 +48,6 @@ from loopcal.diagnose.error_causes import (
 from loopcal.diagnose.error_frames import BASE, FITTED, RELATIVE
 from loopcal.diagnose.fit_examination import check_start_values, compute_reading_errors, examine_fit
 from loopcal.diagnose.gauge_freedoms import interpret_fit
-from loopcal.diagnose.identifiable_parameters import (
-    describe_missing_equations,
-    identifiability,
-    suggest_measurements,
-)
 from loopcal.diagnose.measured_points import compare_shapes, report_base_targets
 from loopcal.diagnose.model_discrepancy import find_dense_regions
 from loopcal.diagnose.outliers import find_outliers
@@ -77,7 +72,6 @@ from loopcal.estimate.penalties import LeastSquares
 from loopcal.estimate.posterior import DISCREPANCY
 from loopcal.estimate.prior import refuse_reused_rows
 from loopcal.estimate.problem import problem_of
-from loopcal.estimate.recalibration import Change, recalibrate
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, Severity, report_finding, sort_by_importance
 from loopcal.measure.array_checks import check_type
@@ -91,6 +85,7 @@ from loopcal.typing import Progress, StepCounter, report_no_progress
 
 if TYPE_CHECKING:
     from loopcal.diagnose.cross_validation import ModelChoice
+    from loopcal.estimate.recalibration import Change
 
 # Codes of data that a geometry cannot reach.
 OUT_OF_REACH = ("residuals.poses-out-of-reach", "residuals.calibrated-out-of-reach")
@@ -261,6 +256,8 @@ def _fit(
     fit_options = replace(options.fit, excluded_poses=excluded)
     count.begin("choosing the parameters" if options.choose_model else "preparing")
     if options.prior is not None:
+        from loopcal.estimate.recalibration import recalibrate
+
         count.begin("fitting")
         how = {"options": fit_options, "progress": count.progress}
         fit, change = recalibrate(robot, data, options.prior, options.free_limb, **how)
@@ -279,6 +276,8 @@ def _fit(
         problem = problem_of(select_free_parameters(chosen), data)
         z = problem.free.deviation(chosen.values[None])
         if not has_equations_to_spare(problem, z, LeastSquares()):
+            from loopcal.diagnose.identifiable_parameters import describe_missing_equations
+
             missing = describe_missing_equations(chosen, data) or ""
             counts: dict[str, Any] = {"equations": available, "parameters": free}
             counts |= {"held_out": held_out, "suggestions": missing}
@@ -316,6 +315,8 @@ def _report(
     count.begin("looking for further measurements")
     suggestions = None
     if fit.converged and fit.unidentifiable:
+        from loopcal.diagnose.identifiable_parameters import identifiability, suggest_measurements
+
         analysis = identifiability(fit.robot, fitted, fit.options.rank_tolerance)
         listed = suggest_measurements(analysis)
         suggestions = tuple(s for s in listed if not s.combination.is_harmless)

@@ -198,8 +198,9 @@ def _describe(robot: Mechanism, view: View) -> Finding:
 
 def describe_stations(plan: Plan) -> Iterator[str]:
     """Yield a line on each station of a camera: where it is, how it sees the board at its poses."""
-    T, cameras = inverse(plan.robot, plan.poses.coordinates).T, np.array(plan.poses.cameras)
+    cameras, coordinates = np.array(plan.poses.cameras), plan.poses.coordinates
     for kind in (sensor.kind for sensor in plan.instrument.sensors):
         if isinstance(kind, Image) and kind.mount == "board":
-            own = T[cameras == kind.camera] if len(cameras) else T
-            yield f"{kind.camera}: {_describe(plan.robot, _watch(kind, own))}"
+            own = coordinates[cameras == kind.camera] if len(cameras) else coordinates
+            view = _watch(kind, inverse(plan.robot, own).T)
+            yield f"{kind.camera}: {_describe(plan.robot, view)}"

@@ -450,6 +450,8 @@ def _arrange_poses(
         place[station, poses[visits[-1].order]] = len(ordered) + np.arange(len(poses))
         ordered = np.append(ordered, poses[visits[-1].order])
         stations = np.append(stations, np.full(len(poses), station))
+    via_home = np.concatenate([visit.via_home for visit in visits])
+    via_home[1:] |= np.diff(stations) != 0  # a further station begins at home
     readings = candidates.solution.q[ordered]
     # no instrument resolves the difference
     steps = list_steps(robot, [a.dimension for a in robot.actuators], DIGITS)
@@ -460,10 +462,7 @@ def _arrange_poses(
         candidates.coordinates[ordered],
         np.round(readings / steps) * steps + 0.0,  # + 0: no reading is -0
         np.isin(ordered, members[held_out]),
-        np.concatenate(
-            [np.append(i or v.via_home[0], v.via_home[1:]) for i, v in enumerate(visits)]
-        )
-        > 0,
+        via_home,
         place[station_of[:, None], selected],
         sum(visit.length for visit in visits),
         tuple(names[i] for i in stations) if count > 1 else (),

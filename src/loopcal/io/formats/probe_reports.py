@@ -27,6 +27,7 @@ from loopcal.io.formats.program_format import MM, ImportOptions, parse_number
 from loopcal.io.robot.robot_file import build_robot
 from loopcal.measure.kinds.poses import Component
 from loopcal.measure.measurements import Measurements
+from loopcal.measure.observations import report_days
 from loopcal.mechanism.solutions import inverse
 from loopcal.typing import FloatArray
 
@@ -130,8 +131,6 @@ def read_reports(
     """Return the probed points of the reports of a firmware, and findings about them; FileError
     where there are none. `probe` : X, Y and Z that files state of it [mm].
     """
-    from loopcal.measure.observations import report_days
-
     texts = {path: read_text(path, "probe report") for path in paths}
     read = _read_marlin if firmware == "marlin" else _read_reprap
     probed, touched, noted = read(texts, probe)

@@ -37,7 +37,6 @@ from loopcal.mechanism.families.placement import (
     translate,
 )
 from loopcal.mechanism.families.records import RobotRecord, check_spherical, values_per_leg
-from loopcal.mechanism.joint_graph.graph import find_perpendicular
 from loopcal.typing import FloatArray
 from loopcal.units import Angle, Dimension, Length, Ratio
 
@@ -81,7 +80,7 @@ def build_leg(
         gap, f"{name} has length zero at home. Move its centers or the home pose"
     )
     pitch = turned = 0.0
-    lower = upper = find_perpendicular(s, EZ)
+    lower = upper = geometry.find_perpendicular(s, EZ)
     if screw:
         zero = f"a joint axis of {name} is [0, 0, 0]. Give a direction"
         (lower, _), (upper, _) = (_normalize(axis, zero) for axis in screw[1:])
@@ -91,7 +90,7 @@ def build_leg(
                 f"a screw's joint axis lies along {name} at home. Give it another direction"
             )
         pitch = screw[0] / (2 * np.pi)
-    low, high = (find_perpendicular(s, axis) for axis in (lower, upper))
+    low, high = (geometry.find_perpendicular(s, axis) for axis in (lower, upper))
     if screw:
         turned = float(np.arctan2(np.cross(low, high) @ s, low @ high))
     # the axes in the base frame, which is the carried frame while every joint is at zero

@@ -101,20 +101,12 @@ def list_axes_across(axis: FloatArray) -> str:
     return "".join(a for a, part in zip("xyz", np.abs(axis), strict=True) if part < 1 - 1e-9)
 
 
-def find_perpendicular(axis: FloatArray, near: FloatArray) -> FloatArray:
-    """Return the unit vector (3,) across an axis that is nearest to another vector."""
-    across = near - axis * (axis @ near)
-    if np.linalg.norm(across) < 1e-6:
-        across = np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
-    return np.asarray(across / np.linalg.norm(across), dtype=np.float64)
-
-
 def turn_between(vector: FloatArray, target: FloatArray) -> FloatArray:
     """Return a rotation (3, 3) that turns a unit vector into another."""
     across = np.cross(vector, target)
     sine, cosine = float(np.linalg.norm(across)), float(vector @ target)
     if sine < 1e-12:
-        across, sine = find_perpendicular(vector, vector), 1.0
+        across, sine = geometry.find_perpendicular(vector, vector), 1.0
         return geometry.exp_so3(across * (0.0 if cosine > 0 else np.pi))
     return geometry.exp_so3(across / sine * np.arctan2(sine, cosine))
 

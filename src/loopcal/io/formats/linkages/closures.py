@@ -37,13 +37,7 @@ from loopcal.io.formats.linkages.tree import (
     make_end,
     require_links,
 )
-from loopcal.mechanism.joint_graph.graph import (
-    Coupling,
-    GraphJoint,
-    find_perpendicular,
-    list_axes_across,
-    turn_between,
-)
+from loopcal.mechanism.joint_graph.graph import Coupling, GraphJoint, list_axes_across, turn_between
 from loopcal.mechanism.joint_graph.loops import JointGraph
 from loopcal.mechanism.joint_graph.paths import (
     Bodies,
@@ -363,7 +357,7 @@ def _build_constraint(tree: LinkTree, constraint: Constraint) -> tuple[Weld | Gr
         return (GraphJoint(name, kind, a, b, A, B, first, near, far, shifts),)
     # the cross: at value zero the second axis is turned across the first
     cross = f"cross of {name}"
-    across = find_perpendicular(first, second)
+    across = geometry.find_perpendicular(first, second)
     turn = geometry.make_pose(turn_between(second, across), np.zeros(3))
     return (
         GraphJoint(f"{name}_1", "R", a, cross, A, np.eye(4), first, near),
