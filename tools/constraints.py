@@ -17,18 +17,19 @@ MINORS = ("3.11", "3.12", "3.13", "3.14")
 
 
 def find_python(minor: str) -> str | None:
-    """Return an interpreter of this minor version that can make virtual environments, or None."""
+    """Return the oldest interpreter of this minor version that can make virtual environments, or
+    None: newer ones can install what it can, but some releases refuse Python 3.11.2 of Debian 12.
+    """
     pyenv = Path(os.environ.get("PYENV_ROOT", Path.home() / ".pyenv"))
-    installed = sorted(str(path) for path in pyenv.glob(f"versions/{minor}.*/bin/python{minor}"))
-    for candidate in (f"python{minor}", *reversed(installed)):
+    installed = (str(path) for path in pyenv.glob(f"versions/{minor}.*/bin/python{minor}"))
+    script, found = "import ensurepip, sys, venv; print(sys.version_info[2])", dict[int, str]()
+    for candidate in (f"/usr/bin/python{minor}", f"python{minor}", *installed):
         try:
-            subprocess.run(
-                [candidate, "-c", "import ensurepip, venv"], check=True, capture_output=True
-            )
+            done = subprocess.run([candidate, "-c", script], check=True, capture_output=True)
         except (OSError, subprocess.CalledProcessError):
             continue
-        return candidate
-    return None
+        found.setdefault(int(done.stdout), candidate)
+    return found[min(found)] if found else None
 
 
 def freeze(python: str) -> list[str]:
