@@ -327,7 +327,7 @@ def draw_volume(accuracy: VolumeAccuracy) -> Figure:
         all_axes = (axes.xaxis, axes.yaxis, axes.zaxis)
         for name, of_name, axis in zip(names, units, all_axes, strict=False):
             axis.set_label_text(f"{name} [{of_name.symbol}]", fontsize=LABEL)
-        axes.set_box_aspect(np.where(extent > 0.0, extent, thin), zoom=1.1 if count > 2 else 0.85)
+        axes.set_box_aspect(np.where(extent > 0.0, extent, thin), zoom=0.95 if count > 2 else 0.85)
         axes.tick_params(labelsize=SMALL)
         axes.locator_params(nbins=4)
         for axis in all_axes[count:]:
