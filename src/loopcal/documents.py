@@ -23,7 +23,6 @@ from loopcal.apply.volume_accuracy import VolumeAccuracy, VolumeLike, bound_erro
 from loopcal.errors import FileError, LoopcalError
 from loopcal.estimate.posterior import posterior_from_arrays
 from loopcal.estimate.result import residuals_from_arrays
-from loopcal.findings import report_finding
 from loopcal.io.core.outputs import refuse_outputs, write_files
 from loopcal.io.core.text_file import as_path, to_json, write_bytes, write_text
 from loopcal.io.formats import FORMATS
@@ -178,8 +177,7 @@ def check_ending(path: Path, what: str, endings: tuple[str, ...] = HTML) -> str:
     if ending not in endings:
         allowed = tuple(name for name in endings if name != SHORT_HTML)
         shown = quote(path.suffix) if path.suffix else ""
-        finding = report_finding("files.document-ending", what=what, allowed=allowed, ending=shown)
-        raise FileError(finding, path)
+        raise FileError.of("files.document-ending", path, what=what, allowed=allowed, ending=shown)
     return ending
 
 

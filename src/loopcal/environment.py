@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 from loopcal.errors import LoopcalError, MissingPackageError
-from loopcal.findings import report_finding
 
 # Variables by which libraries of linear algebra choose their threads, before numpy is imported. One
 # thread makes the last digits of results independent of the machine's settings. It is also the
@@ -91,5 +90,4 @@ def import_optional(
     try:
         return import_module(module)
     except ImportError as cause:
-        finding = report_finding("workers.package-missing", package=module, extra=extra)
-        raise error(finding) from cause
+        raise error.of("workers.package-missing", package=module, extra=extra) from cause

@@ -11,12 +11,10 @@ import difflib
 from collections.abc import Iterable
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any, Self
 
+from loopcal.findings import Finding, report_finding
 from loopcal.plain_text import escape
-
-if TYPE_CHECKING:
-    from loopcal.findings import Finding
 
 MOST_NAMES = 2000  # names that are compared with a wrong one, which takes some microseconds each
 
@@ -24,12 +22,17 @@ MOST_NAMES = 2000  # names that are compared with a wrong one, which takes some 
 class LoopcalError(Exception):
     """Base of all errors that a user can cause and repair; made from a sentence or a finding."""
 
+    @classmethod
+    def of(cls, code: str, /, *place: Any, **data: Any) -> Self:
+        """Return the error of a finding of the catalog; place : path and line of a `FileError`."""
+        return cls(report_finding(code, **data), *place)
+
     @property
     def code(self) -> str | None:
         """Code of the finding behind this error, or behind the error that caused it; None where
         both were made from sentences.
         """
-        return getattr(self.finding, "code", None)
+        return None if self.finding is None else self.finding.code
 
     @property
     def finding(self) -> Finding | None:
@@ -37,9 +40,9 @@ class LoopcalError(Exception):
         made from sentences.
         """
         content = self.args[0] if self.args else None
-        if not hasattr(content, "code") and isinstance(self.__cause__, LoopcalError):
-            return self.__cause__.finding
-        return content if hasattr(content, "code") else None
+        if isinstance(content, Finding):
+            return content
+        return self.__cause__.finding if isinstance(self.__cause__, LoopcalError) else None
 
 
 class UnitError(LoopcalError):

@@ -79,7 +79,7 @@ Row = tuple[str, dict[str, str]]
 def make_pace(minutes: float | None, speed: float | None) -> Pace:
     """Return how long poses take; `speed` [mm per minute] without `minutes` is a DataError."""
     if speed is not None and minutes is None:
-        raise DataError(report_finding("session.speed-alone"))
+        raise DataError.of("session.speed-alone")
     return Pace(minutes) if speed is None else Pace(minutes, 1e-3 * speed)
 
 

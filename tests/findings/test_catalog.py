@@ -36,14 +36,16 @@ def parse_modules() -> dict[str, ast.Module]:
 
 
 def list_reported_findings() -> Iterator[tuple[str, str, set[str]]]:
-    """Return place, code and names of data of every `report_finding` with a literal code."""
+    """Return place, code and names of data of every finding, reported or raised, with a
+    literal code.
+    """
     for name, tree in parse_modules().items():
         for node in ast.walk(tree):
             if not isinstance(node, ast.Call) or not node.args:
                 continue
-            called = getattr(node.func, "id", getattr(node.func, "attr", ""))
-            code = node.args[0]
-            if called == "report_finding" and isinstance(code, ast.Constant):
+            called, code = ast.unparse(node.func), node.args[0]
+            is_finding = re.fullmatch(r"report_finding|\w+Error\.of", called)
+            if is_finding and isinstance(code, ast.Constant):
                 given = {keyword.arg or "" for keyword in node.keywords} - {"severity"}
                 yield f"{name}:{node.lineno}", str(code.value), given
 

@@ -72,7 +72,7 @@ def clean_name(name: str) -> str:
     last = re.split(r"[/\\]", make_name(cut))[-1]
     safe = re.sub(r'[<>:"|?*]', "_", last).lstrip(".- ").rstrip(". ")
     if not safe:
-        raise DataError(report_finding("app.unnamed"))
+        raise DataError.of("app.unnamed")
     safe = safe if Path(safe).suffix else f"{safe}.txt"
     return safe if safe == name else clean_name(safe)
 
@@ -94,7 +94,7 @@ def check_facts(maker: Callable[..., Any], facts: Any) -> dict[str, Any]:
     except TypeError:
         facts = {"": None}
     if not all(key in hints and fits(value, hints[key]) for key, value in facts.items()):
-        raise DataError(report_finding("app.wrong"))
+        raise DataError.of("app.wrong")
     return facts
 
 
@@ -102,7 +102,7 @@ def read_number(text: str | None, least: float = sys.float_info.min) -> float | 
     """Return a number that was typed, if there is one; DataError if it is below `least`."""
     number = parse_finite(read_typed(text or "") or "")
     if text and (number is None or number < least):
-        raise DataError(report_finding("session.no-number", text=repr(text)))
+        raise DataError.of("session.no-number", text=repr(text))
     return number
 
 
@@ -111,7 +111,7 @@ def check_text(name: str, content: bytes) -> None:
     code = next((code for mark, code in MARKS.items() if content.startswith(mark)), "")
     if code or b"\0" in content or not content.strip():
         code = code or ("binary" if content.strip() else "empty")
-        raise FileError(report_finding(f"app.{code}"), name)
+        raise FileError.of(f"app.{code}", name)
 
 
 def recognize(path: Path) -> str:
@@ -156,7 +156,7 @@ class Project:
         self.version: int = 0
         self.opened: ExitStack[bool | None] = ExitStack()
         if any(folder.iterdir()) and not self.has(STATE):
-            raise FileError(report_finding("session.other-content"), folder)
+            raise FileError.of("session.other-content", folder)
         known = read_json(folder / STATE, "choices", "remove it") if self.has(STATE) else {}
         try:
             self.chosen: Choices = Choices(**check_facts(Choices, known))
@@ -165,7 +165,7 @@ class Project:
         except DataError:
             is_ours = False
         if not is_ours or any(path.is_symlink() for path in folder.rglob("*")):
-            raise FileError(report_finding("app.choices"), folder / STATE)
+            raise FileError.of("app.choices", folder / STATE)
         self.store()
         self.work: Work = Work(folder, self.touch, self.store, self.word)
         self.session: MeasuringSession | None = None
@@ -300,9 +300,9 @@ class Project:
     def plan(self, instrument: str, poses: str, accuracy: str, sigma: str) -> dict[str, list[str]]:
         """Plan which poses to measure, unless rows of another plan are there."""
         if (self.folder / "session").exists():
-            raise DataError(report_finding("app.measured"))
+            raise DataError.of("app.measured")
         if instrument not in INSTRUMENTS:
-            raise DataError(report_finding("app.wrong"))
+            raise DataError.of("app.wrong")
         options = [*INSTRUMENTS[instrument], f"--sigma-position={sigma}" if sigma else ""]
         options += [f"--accuracy={accuracy}" if accuracy else f"--poses={poses}"]
         words = ["plan", self.robot, "-o", "plan", "--force", *filter(None, options)]
@@ -311,9 +311,9 @@ class Project:
     def _import(self, has_data: bool) -> dict[str, list[str]]:
         """Return the command that reads the program's file, unless it was read."""
         if not self.robot:
-            raise DataError(report_finding("app.no-robot"))
+            raise DataError.of("app.no-robot")
         if has_data and not self.data:
-            raise DataError(report_finding("app.no-data"))
+            raise DataError.of("app.no-data")
         is_inside = has_data and not (self.chosen.is_measured or self.list_files("data"))
         made = [self.robot, *self.data[: int(is_inside)]]
         if not self.program or not self.imported or all(map(self.has, made)):
@@ -346,7 +346,7 @@ class Project:
     def correct(self, file: str, line: int, column: int, text: str) -> None:
         """Replace a cell of a measurement file."""
         if file not in self.data:
-            raise DataError(report_finding("app.gone"))
+            raise DataError.of("app.gone")
         correct_cell(self.folder / file, line, column, text)
         known = self._list_poses()  # one of them may have another name
         self.chosen.dropped = [each for each in self.chosen.dropped if each in known]
@@ -355,7 +355,7 @@ class Project:
     def leave_out(self, pose: str, is_out: bool) -> None:
         """Leave a pose out of the next calibration, or use it again."""
         if pose not in self._list_poses():
-            raise DataError(report_finding("app.gone"))
+            raise DataError.of("app.gone")
         others = [each for each in self.chosen.dropped if each != pose]
         self.chosen.dropped = others + [pose] * is_out
         self.store(edits=1)
@@ -373,7 +373,7 @@ class Project:
 
         sheets = [name for name in (SHEET, *self.list_files("data")) if self.has(name)]
         if not sheets:
-            raise DataError(report_finding("app.no-plan"))
+            raise DataError.of("app.no-plan")
         if self.session is not None:
             return {}
         if steps := self._import(has_data=False):

@@ -32,7 +32,6 @@ from tornado.web import Application, HTTPError, RequestHandler, stream_request_b
 
 from loopcal.app.project import Project, check_facts
 from loopcal.errors import DataError, LoopcalError
-from loopcal.findings import report_finding
 from loopcal.io.core.limits import UPLOAD_SIZE
 from loopcal.io.data.kind_settings import KindRows
 from loopcal.io.exports.growing_export import POLL, GrowingExport
@@ -86,12 +85,12 @@ class Handler(RequestHandler):
         with suppress(ValueError):
             is_known = is_known or bool(ip_address(host))
         if not is_known or self.request.headers.get("Origin", own) != own:
-            raise DataError(report_finding("app.foreign"))
+            raise DataError.of("app.foreign")
         given = self.get_query_argument("token", self.get_cookie(cookie, "") or "")
         if given in (once := self.settings["once"]):
             once.clear()
         elif not hmac.compare_digest(given.encode(), token.encode()):
-            raise DataError(report_finding("app.denied"))
+            raise DataError.of("app.denied")
         self.set_cookie(cookie, token, httponly=True, samesite="Strict")
         UPLOAD_SIZE.check(int(self.request.headers.get("Content-Length", 0)), "file", "page")
 
@@ -130,7 +129,7 @@ class Handler(RequestHandler):
         elif name in self.project.list_downloads() and self.project.has(name):
             self._send_file(self.project.folder / name)
         else:
-            raise DataError(report_finding("app.gone"))
+            raise DataError.of("app.gone")
 
     async def _send_events(self) -> None:
         self.set_header("Content-Type", "text/event-stream")
@@ -172,14 +171,14 @@ class Handler(RequestHandler):
             facts = check_facts(action, body)
             await self._act(lambda: action(**facts))
         else:
-            raise DataError(report_finding("app.gone"))
+            raise DataError.of("app.gone")
 
     async def _act(self, action: Callable[[], Any]) -> None:
         """Act on the project, once at a time, while others are answered; run the commands."""
         project = self.project
         async with self.settings["lock"]:
             if project.work.task is not None:
-                raise DataError(report_finding("app.busy"))
+                raise DataError.of("app.busy")
             if steps := await asyncio.to_thread(action):
                 project.work.begin(steps, project.chosen)
             project.touch()
@@ -211,7 +210,7 @@ async def serve(
         sockets = bind_sockets(port, host)
     except (OSError, UnicodeError) as error:
         facts = {"host": host, "port": port, "reason": getattr(error, "strerror", None) or "name"}
-        raise DataError(report_finding("app.address", **facts)) from error
+        raise DataError.of("app.address", **facts) from error
     port = sockets[0].getsockname()[1]
     facts = {"project": project, "token": token, "host": host.lower(), "ended": ended}
     facts |= {"once": {once}}

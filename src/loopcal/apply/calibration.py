@@ -153,7 +153,7 @@ def calibrate(
     split = split_data(kept, options.hold_out, options.seed, options.held_out)
     is_limited = (options.limit_position, options.limit_angle) != (None, None)
     if is_limited and split.held_out is None:
-        raise DataError(report_finding("workflow.limit-needs-held-out-poses"))
+        raise DataError.of("workflow.limit-needs-held-out-poses")
     if options.check_conventions:
         # no pose can be reached from a frame that does not fit, and a fit would blame the robot
         for shape in compare_shapes(data):
@@ -170,12 +170,12 @@ def calibrate(
     # with them takes all of its iterations
     finding = conventions.finding
     if options.choose_model and finding is not None and finding.code == "conventions.rows-far-off":
-        raise DataError(report_finding("model.rows-far-off", poses=finding.data["poses"]))
+        raise DataError.of("model.rows-far-off", poses=finding.data["poses"])
     redundant = robot.redundancy is not None  # then readings are measurements, too
     if not split.fitted.n_rows and not redundant:
-        raise DataError(report_finding("data.no-measured-value"))
+        raise DataError.of("data.no-measured-value")
     if split.held_out is not None and not split.held_out.n_rows and not redundant:
-        raise DataError(report_finding("data.no-held-out-value"))
+        raise DataError.of("data.no-held-out-value")
     held_out = 0 if split.held_out is None else split.held_out.n_poses
     fit, choice, change = _fit(robot, split.fitted, options, count, held_out)
     count.begin("testing the residuals for patterns and slow errors")
@@ -269,7 +269,7 @@ def _fit(
         choice = choose_model(robot, data, options=fit_options, progress=count.progress)
         if not choice.chosen.parameters:
             left_out = choice.finding.data["not_compared"]
-            raise DataError(report_finding("workflow.no-parameter-chosen", not_compared=left_out))
+            raise DataError.of("workflow.no-parameter-chosen", not_compared=left_out)
     chosen = robot if choice is None else choice.robot
     free, available = int(chosen.parameters.free.sum()), count_equations(chosen, data)
     if fit_options.method is None and available < free:
@@ -281,7 +281,7 @@ def _fit(
             missing = describe_missing_equations(chosen, data) or ""
             counts: dict[str, Any] = {"equations": available, "parameters": free}
             counts |= {"held_out": held_out, "suggestions": missing}
-            raise DataError(report_finding("workflow.too-few-equations", **counts))
+            raise DataError.of("workflow.too-few-equations", **counts)
     count.begin(f"fitting {free} parameters")
     fit = identify(chosen, data, options=fit_options, progress=count.progress)
     return fit, choice, None

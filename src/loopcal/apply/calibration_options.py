@@ -14,7 +14,6 @@ from loopcal.diagnose.error_frames import FITTED
 from loopcal.errors import DataError, suggest_names
 from loopcal.estimate.options import OBJECT, FitOptions, check_labels
 from loopcal.estimate.posterior import Posterior
-from loopcal.findings import report_finding
 from loopcal.measure.array_checks import check_seed, check_type
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations
@@ -106,7 +105,7 @@ class CalibrationOptions:
         check_limit("limit_position", self.limit_position)
         check_limit("limit_angle", self.limit_angle)
         if self.free_limb is not None and self.prior is None:
-            raise DataError(report_finding("workflow.free-limb-needs-prior", limb=self.free_limb))
+            raise DataError.of("workflow.free-limb-needs-prior", limb=self.free_limb)
         chosen = {
             "method": self.fit.method is not None,
             "loss": self.fit.loss is not None,
@@ -114,7 +113,7 @@ class CalibrationOptions:
         }
         excluded = [option for option, is_chosen in chosen.items() if is_chosen]
         if self.prior is not None and excluded:
-            raise DataError(report_finding("workflow.option-excludes-prior", option=excluded[0]))
+            raise DataError.of("workflow.option-excludes-prior", option=excluded[0])
 
     def to_dict(self) -> dict[str, Any]:
         """Return the options as plain data; an object is `{object: text}`, see `FitOptions`."""
@@ -172,7 +171,7 @@ def split_data(
     """
     stated = tuple(label for label, out in zip(data.labels, data.is_held_out, strict=True) if out)
     if stated and (hold_out or (held_out and set(held_out) != set(stated))):
-        raise DataError(report_finding("data.held-out-twice", count=len(stated)))
+        raise DataError.of("data.held-out-twice", count=len(stated))
     held_out = stated or held_out
     if held_out:
         for label in held_out:

@@ -183,10 +183,10 @@ def check_up(
     EstimationError : the run does not contain its uncertainty.
     """
     if not checks or not 0.0 < false_alarms < 1.0 or a_year < 1:
-        raise DataError(report_finding("checks.options", rate=false_alarms, a_year=a_year))
+        raise DataError.of("checks.options", rate=false_alarms, a_year=a_year)
     uncertainty = run.load_uncertainty()
     if uncertainty is None or not np.isfinite(uncertainty.spread).all():
-        raise EstimationError(report_finding("checks.no-uncertainty"))
+        raise EstimationError.of("checks.no-uncertainty")
     level = false_alarms / a_year
     rows: list[CheckRows] = []
     done: list[Check] = []
@@ -201,7 +201,7 @@ def check_up(
         notes += [] if reused is None else [reused]
         again = seen.find_in(data)
         if again.count and again.count >= REFUSED_SHARE * again.total:
-            raise DataError(report_finding("checks.rows-repeated", check=name, **again._asdict()))
+            raise DataError.of("checks.rows-repeated", check=name, **again._asdict())
         seen = seen.joined(collect_fitted_rows(data))
         made, errors = _collect_rows(run, uncertainty, data, refit)
         rows.append(made)
@@ -312,7 +312,7 @@ def _judge(
     combined = [_combine(uncertainty, rows[-size:]) for size in sizes]
     changes = [changes for changes, *_ in combined]
     if not changes[-1].degrees:
-        raise DataError(report_finding("checks.nothing-determined"))
+        raise DataError.of("checks.nothing-determined")
     bounds = [each.bound_probability() for each in changes]
     best = int(np.argmin(np.nan_to_num(bounds, nan=np.inf)))
     tests, robot = len(sizes) + 1, uncertainty.posterior.robot

@@ -317,17 +317,17 @@ def _use_map(posterior: Posterior | None) -> tuple[Finding, Posterior]:
     EstimationError: there is no map, or it is no proven gain.
     """
     if posterior is None:
-        raise EstimationError(report_finding("compensation.map-needs-run"))
+        raise EstimationError.of("compensation.map-needs-run")
     own = posterior.discrepancy
     if own is None:
-        raise EstimationError(report_finding("compensation.map-not-tested", is_smooth=False))
+        raise EstimationError.of("compensation.map-not-tested", is_smooth=False)
     before, after, lowest, regions = own.test.tolist()
     values: dict[str, Any] = {"before": before, "after": after, "regions": int(regions)}
     values["lowest"] = 100.0 * lowest
     if np.isnan(lowest):
-        raise EstimationError(report_finding("compensation.map-not-tested", is_smooth=True))
+        raise EstimationError.of("compensation.map-not-tested", is_smooth=True)
     if not len(own.mean):
-        raise EstimationError(report_finding("compensation.map-no-gain", **values))
+        raise EstimationError.of("compensation.map-no-gain", **values)
     corrected = replace(posterior, discrepancy=replace(own, is_corrected=True))
     return report_finding("compensation.map-gain", **values), corrected
 

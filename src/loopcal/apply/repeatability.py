@@ -190,7 +190,7 @@ def assess_repeatability(
         and {g.quantity for g in o.kind.error_groups} & DIMENSIONS.keys()
     )
     if not kept:
-        raise DataError(report_finding("repeatability.nothing-measured"))
+        raise DataError.of("repeatability.nothing-measured")
     # commanded poses are far apart, whatever the noise of the instrument is
     member = find_repeats(data.readings, find_reading_tolerance(data.readings, ()))
     sums = np.zeros((int(member.max()) + 1, data.readings.shape[1]))
@@ -211,7 +211,7 @@ def assess_repeatability(
                     for key, value in _find_variations(visited).items():
                         variations[key] = max(value, variations.get(key, 0.0))
     if not any(poses.values()):
-        raise DataError(report_finding("repeatability.no-repeats"))
+        raise DataError.of("repeatability.no-repeats")
     setup = group_setup(compared.after)
     errors = compute_row_errors(rows, residuals)
     described = {quantity: tuple(of) for quantity, of in poses.items() if of}

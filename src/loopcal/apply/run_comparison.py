@@ -270,15 +270,15 @@ def _check_runs(runs: Sequence[Run]) -> None:
     if not is_list or not all(hasattr(run, name) for run in runs for name in NEEDED):
         raise DataError("runs: give a list of runs, such as [load_run('may'), load_run('june')]")
     if len(runs) < 2:
-        raise DataError(report_finding("runs.too-few", count=len(runs)))
+        raise DataError.of("runs.too-few", count=len(runs))
     known = set()
     for run in runs:
         place = run.path.resolve()
         if place in known:
-            raise DataError(report_finding("runs.given-twice", run=str(run.path)))
+            raise DataError.of("runs.given-twice", run=str(run.path))
         known.add(place)
         if not run.result.get("fit", {}).get("parameters"):
-            raise DataError(report_finding("runs.no-calibration", run=str(run.path)))
+            raise DataError.of("runs.no-calibration", run=str(run.path))
 
 
 def _refuse_incomparable(
@@ -293,7 +293,7 @@ def _refuse_incomparable(
     def refuse_lonely(code: str, mine: Sequence[str], theirs: Sequence[str]) -> None:
         for name in (n for n in (*mine, *theirs) if (n in mine) != (n in theirs)):
             place = words["first" if name in mine else "second"]
-            raise DataError(report_finding(code, **words, name=name, place=place))
+            raise DataError.of(code, **words, name=name, place=place)
 
     mine, theirs = first.robot, second.robot
     refuse_lonely("runs.other-parameters", mine.parameters.names, theirs.parameters.names)
@@ -301,7 +301,7 @@ def _refuse_incomparable(
     for what, text in _list_structure(mine).items():
         if text != structure[what]:
             data: dict[str, Any] = {"what": what, "mine": text, "theirs": structure[what]}
-            raise DataError(report_finding("runs.other-mechanism", **words, **data))
+            raise DataError.of("runs.other-mechanism", **words, **data)
     free = [_list_free(run) for run in (first, second)]
     if not is_same_data:
         refuse_lonely("runs.other-free", *free)
@@ -314,7 +314,7 @@ def _refuse_incomparable(
         if abs(values[0] - values[1]) > EQUAL * size:
             shown = [mine.to_quantity(value, dimension) for value in values]
             data = {"name": name, "mine": shown[0], "theirs": shown[1]}
-            raise DataError(report_finding("runs.other-fixed-value", **words, **data))
+            raise DataError.of("runs.other-fixed-value", **words, **data)
     refuse_other_dimensions(mine, theirs, (words["first"], words["second"]))
 
 
@@ -374,7 +374,7 @@ def _read_errors(run: Run, poses: Sequence[str] | None = None) -> PoseErrors:
         validation = stored and restore_validation(stored, run.arrays, run.robot)
     except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
         problem = "'validation' is not what a calibration writes"
-        raise FileError(report_finding("files.run-damaged", problem=problem), run.path) from error
+        raise FileError.of("files.run-damaged", run.path, problem=problem) from error
     if not validation:
         return PoseErrors()
     labels = validation.poses

@@ -24,7 +24,6 @@ import click
 import loopcal as lc
 from loopcal.cli import terminal
 from loopcal.errors import DataError, LoopcalError, UnitError, suggest_names
-from loopcal.findings import report_finding
 from loopcal.registry import Registry
 from loopcal.units import Dimension, find_unit, parse_goal, parse_number, parse_quantity
 
@@ -490,7 +489,7 @@ def read_measurements(
         if stated not in ("", robot.name):
             facts: Any = {"file": str(path), "stated": stated, "used": robot.name}
             if is_check:
-                raise DataError(report_finding("checks.other-robot", **facts))
+                raise DataError.of("checks.other-robot", **facts)
             terminal.print_finding("workflow.robot-of-other-name", **facts)
     try:
         with terminal.TerminalProgress("reading the measurements"):

@@ -458,7 +458,7 @@ def choose_blocks(data: Measurements, unit: str | int | None = None) -> Clusters
         names, member = np.unique(joined, return_inverse=True)
         runs = Clusters(f"{unit}-pose run", member, len(names))
         if runs.count < FEWEST_CLUSTERS:
-            raise EstimationError(report_finding("sampling.too-few-blocks", unit=runs.unit))
+            raise EstimationError.of("sampling.too-few-blocks", unit=runs.unit)
         return runs
     if unit is not None and unit not in UNITS:
         raise EstimationError(
@@ -467,16 +467,14 @@ def choose_blocks(data: Measurements, unit: str | int | None = None) -> Clusters
         )
     divisions = divide_into_clusters(data)
     if not divisions:
-        raise EstimationError(report_finding("sampling.too-few-blocks", unit=unit or "pose"))
+        raise EstimationError.of("sampling.too-few-blocks", unit=unit or "pose")
     if unit is None:
         enough = (blocks for blocks in divisions if blocks.count >= ENOUGH_BLOCKS)
         return next(enough, divisions[-1])
     named = [blocks for blocks in divisions if blocks.unit == unit]
     if not named:
         available = tuple(f"{blocks.count} {blocks.unit}s" for blocks in divisions)
-        raise EstimationError(
-            report_finding("sampling.unit-unknown", unit=unit, available=available)
-        )
+        raise EstimationError.of("sampling.unit-unknown", unit=unit, available=available)
     return named[0]
 
 
@@ -634,11 +632,11 @@ def bootstrap(
     if count < 2:
         raise EstimationError(f"{count} resamples: give at least 2")
     if not fit.converged:
-        raise EstimationError(report_finding("sampling.not-converged"))
+        raise EstimationError.of("sampling.not-converged")
     if not np.isfinite(fit.standard_deviations).any():
-        raise EstimationError(report_finding("sampling.without-intervals"))
+        raise EstimationError.of("sampling.without-intervals")
     if scheme == "pairs" and isinstance(fit.method, MAP) and callable(fit.method.inflation):
-        raise EstimationError(report_finding("sampling.pairs-with-rule"))
+        raise EstimationError.of("sampling.pairs-with-rule")
     linear = linearize_fit(fit, data)
     blocks = choose_blocks(linear.data, unit)
     rng, errors, batches = np.random.default_rng(np.random.SeedSequence(seed)), None, []
@@ -659,7 +657,7 @@ def bootstrap(
     fits = ResampleFits.join(batches)
     kept = fits.take(np.flatnonzero(fits.converged))
     if len(kept.deviation) < 2:
-        raise EstimationError(report_finding("sampling.resamples-failed", count=count))
+        raise EstimationError.of("sampling.resamples-failed", count=count)
     nominal, unit_of = fit.nominal, fit.tolerance
     return Bootstrap(
         fit=fit,

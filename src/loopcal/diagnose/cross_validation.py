@@ -153,8 +153,7 @@ def cross_validate(
     folds = _fit_folds(robot, data, options, count, seed, progress)
     for done, (fitted, has_converged, held_out) in enumerate(folds):
         if must_converge and not has_converged:
-            finding = report_finding("model.fold-not-converged", fold=done + 1, count=count)
-            raise EstimationError(finding)
+            raise EstimationError.of("model.fold-not-converged", fold=done + 1, count=count)
         converged = converged and has_converged
         if held_out.n_rows:  # readings alone, of redundant actuators, have a score but no errors
             comparison = compare_predictions(robot, fitted, held_out)

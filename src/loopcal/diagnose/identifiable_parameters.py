@@ -326,15 +326,12 @@ def identifiability(
     free = select_free_parameters(robot)
     if not len(free):
         total = len(robot.parameters)
-        finding = report_finding("fit.no-free-parameter", robot=robot.name, total=total)
-        raise EstimationError(finding)
+        raise EstimationError.of("fit.no-free-parameter", robot=robot.name, total=total)
     count = count_equations(robot, data)
     if not count and data.n_rows:
-        raise EstimationError(
-            report_finding("fit.no-equation-left", poses=data.n_poses, unknowns=len(free))
-        )
+        raise EstimationError.of("fit.no-equation-left", poses=data.n_poses, unknowns=len(free))
     if not count:
-        raise EstimationError(report_finding("fit.no-measured-value"))
+        raise EstimationError.of("fit.no-measured-value")
     unclosed = find_unclosed_poses(robot, data)
     if unclosed.are_most:
         raise EstimationError(unclosed.report("fit.poses-open"))

@@ -357,7 +357,7 @@ def compute_joint_region(
     q = len(chosen.names)
     value, vectors = np.linalg.eigh(chosen.correlation)
     if value[0] < SMALLEST:
-        raise EstimationError(report_finding("sampling.region-dependent", names=chosen.names))
+        raise EstimationError.of("sampling.region-dependent", names=chosen.names)
     white = (vectors / np.sqrt(value)).T / chosen.sd
     degrees = float(chosen.posterior.count_degrees(white @ chosen.effect))
     square = q * float(compute_f_quantile(q, degrees, 1.0 - level))
@@ -441,15 +441,15 @@ def _select(
     if not 0.0 < level < 1.0:
         raise EstimationError(f"level is {level}. Give a probability between 0 and 1")
     if np.isnan(posterior.variance).any():
-        raise EstimationError(report_finding("sampling.without-intervals"))
+        raise EstimationError.of("sampling.without-intervals")
     size = np.abs(posterior.directions[:, np.isinf(posterior.variance)]).max(axis=1, initial=0.0)
     is_known = size <= NULL_COMPONENT
     places = np.flatnonzero(is_known) if names is None else _find_places(posterior.names, names)
     unknown = tuple(posterior.names[i] for i in places[~is_known[places]])
     if combinations is None and unknown:
-        raise EstimationError(report_finding("sampling.region-undetermined", names=unknown))
+        raise EstimationError.of("sampling.region-undetermined", names=unknown)
     if not len(places):
-        raise EstimationError(report_finding("sampling.region-undetermined", names=posterior.names))
+        raise EstimationError.of("sampling.region-undetermined", names=posterior.names)
     effect = np.eye(len(posterior.names))[places]
     labels = tuple(posterior.names[i] for i in places)
     if combinations is not None:
@@ -468,7 +468,7 @@ def _select(
         open_part = effect * posterior.unit @ posterior.directions[:, np.isinf(posterior.variance)]
         length = np.linalg.norm(effect * posterior.unit, axis=1)
         if (np.abs(open_part).max(axis=1, initial=0.0) > NULL_COMPONENT * length).any():
-            raise EstimationError(report_finding("sampling.region-undetermined", names=labels))
+            raise EstimationError.of("sampling.region-undetermined", names=labels)
     center, root = effect @ posterior.estimate, effect @ posterior.root
     sd = np.sqrt((root**2).sum(axis=1))
     correlation = (root / sd[:, None]) @ (root / sd[:, None]).T
@@ -718,12 +718,12 @@ def sample_posterior(
     if count < 100:
         raise EstimationError(f"{count} draws: give at least 100")
     if not fit.converged:
-        raise EstimationError(report_finding("sampling.not-converged"))
+        raise EstimationError.of("sampling.not-converged")
     if fit.method.is_biased:
         name = type(fit.method).__name__
-        raise EstimationError(report_finding("sampling.method-without-prior", method=name))
+        raise EstimationError.of("sampling.method-without-prior", method=name)
     if not fit.residual_test.intervals:
-        raise EstimationError(report_finding("sampling.without-intervals"))
+        raise EstimationError.of("sampling.without-intervals")
     density = describe_density(linearize_fit(fit, data))
     rng = np.random.default_rng(np.random.SeedSequence(seed))
     # the linear posterior with heavier tails
@@ -750,7 +750,7 @@ def sample_posterior(
     assert best is not None
     v, weight, log_q = best
     if not weight.any():
-        raise EstimationError(report_finding("sampling.no-draw-possible", count=count))
+        raise EstimationError.of("sampling.no-draw-possible", count=count)
     tolerance = fit.tolerance
     sd = np.sqrt((density.root**2).sum(axis=1))
     return PosteriorSample(

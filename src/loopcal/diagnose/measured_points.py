@@ -155,7 +155,7 @@ def _refuse_other_unit(table: _Points, stated: str) -> None:
     if distances[unit] * MOVED < as_written:
         typical, before = table.to_quantity(distances[unit]), table.to_quantity(as_written)
         numbers = {"unit": unit, "typical": typical, "before": before}
-        raise DataError(report_finding("sheet.points-unit", stated=stated, **numbers))
+        raise DataError.of("sheet.points-unit", stated=stated, **numbers)
 
 
 def _examine(table: _Points) -> list[Finding]:
@@ -184,7 +184,7 @@ def _examine(table: _Points) -> list[Finding]:
     if split is not None:
         ends = {"first": table.labels[split], "last": table.labels[split - 1]}
     if gain > MOVED:
-        raise DataError(report_finding("sheet.instrument-moved", **ends))
+        raise DataError.of("sheet.instrument-moved", **ends)
     far = _rename(table, predicted, np.argwhere(is_far), limit)
     findings = []
     if ends:
@@ -221,7 +221,7 @@ def _rename(
     )
     if renamed:
         numbers = {"count": len(renamed), "limit": table.to_quantity(limit)}
-        raise DataError(report_finding("sheet.points-misnamed", points=renamed, **numbers))
+        raise DataError.of("sheet.points-misnamed", points=renamed, **numbers)
     return [far[row] for row in rows]
 
 
@@ -254,7 +254,7 @@ def _refuse_shift(table: _Points, typical: float) -> None:
         numbers = {"typical": table.to_quantity(then), "before": table.to_quantity(typical)}
         begin = table.labels[first] if first else ""
         facts = {"is_late": shift > 0, "first": begin, **numbers}
-        raise DataError(report_finding("sheet.points-shifted", **facts))
+        raise DataError.of("sheet.points-shifted", **facts)
 
 
 def _find_smallest(measure: Callable[[int], float], low: int, high: int) -> int | None:

@@ -26,7 +26,6 @@ from loopcal.estimate.pose_estimate import PoseFit, fit_poses, predict_from_read
 from loopcal.estimate.posterior import combine_degrees
 from loopcal.estimate.result import SMALLEST_EFFECT
 from loopcal.estimate.smooth_errors import SmoothErrors
-from loopcal.findings import report_finding
 from loopcal.measure.initial_values import guess_nuisance_values
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.nuisance import NuisanceParameters
@@ -550,7 +549,7 @@ def compare_predictions(
     counted = (o.take((o.weight > 0.0) & o.present.any(axis=1)) for o in data.observations)
     data = _take_rows(replace(data, observations=tuple(counted)), np.ones(data.n_poses, dtype=bool))
     if not data.n_rows and after.redundancy is None:
-        raise DataError(report_finding("residuals.no-rows-to-predict"))
+        raise DataError.of("residuals.no-rows-to-predict")
     first, last = (
         _locate_poses(robot, data, setup or {})
         for robot, setup in ((before, setup_before), (after, setup_after))
@@ -564,14 +563,14 @@ def compare_predictions(
         reaching = [int(each.solution.converged.sum()) for each in (first, last)]
         numbers: dict[str, Any] = {"robot": after.name, "poses": len(predictable)}
         if not predictable.any():
-            raise DataError(report_finding("residuals.readings-missing", **numbers))
+            raise DataError.of("residuals.readings-missing", **numbers)
         if not any(reaching):
-            raise DataError(report_finding("residuals.poses-out-of-reach", **numbers))
+            raise DataError.of("residuals.poses-out-of-reach", **numbers)
         if not reaching[0]:
             numbers = {"poses": len(predictable), "after": reaching[1]}
-            raise DataError(report_finding("residuals.before-out-of-reach", **numbers))
+            raise DataError.of("residuals.before-out-of-reach", **numbers)
         numbers |= {"before": reaching[0], "after": reaching[1]}
-        raise DataError(report_finding("residuals.calibrated-out-of-reach", **numbers))
+        raise DataError.of("residuals.calibrated-out-of-reach", **numbers)
     data = _take_rows(data, usable)
     return PredictionComparison(
         data,

@@ -269,9 +269,7 @@ def compare_with_values(
             if abs(value - kept) > EQUAL * size:
                 given = fit.robot.to_quantity(float(value), dimension)
                 data = {"name": name, "kept": fit.robot.to_quantity(kept, dimension)}
-                raise EstimationError(
-                    report_finding("comparison.fixed-differs", **data, given=given)
-                )
+                raise EstimationError.of("comparison.fixed-differs", **data, given=given)
     indices = [i for i, name in enumerate(fit.names) if name in values]
     if not indices:
         raise EstimationError(
@@ -303,21 +301,19 @@ def refuse_other_dimensions(
             break
     else:
         code = "comparison.nothing-reached"
-        raise EstimationError(report_finding(code, stored=given, robot=called))
+        raise EstimationError.of(code, stored=given, robot=called)
     mine, theirs = (state.T[0][is_reached] for state in states)
     apart = np.linalg.norm(mine[:, :3, 3] - theirs[:, :3, 3], axis=1).max()
     if apart <= EQUAL * robot.size:
         return
     own = forward_trials(stored, stored.values[None], q).T[0][is_reached]
     rotation = align_point_sets(own[:, :3, 3], mine[:, :3, 3])[:3, :3]
-    raise EstimationError(
-        report_finding(
-            "comparison.other-dimensions",
-            stored=given,
-            robot=called,
-            apart=robot.to_quantity(float(apart), Dimension.LENGTH),
-            rotation=float(np.rad2deg(np.linalg.norm(log_so3(rotation)))),
-        )
+    raise EstimationError.of(
+        "comparison.other-dimensions",
+        stored=given,
+        robot=called,
+        apart=robot.to_quantity(float(apart), Dimension.LENGTH),
+        rotation=float(np.rad2deg(np.linalg.norm(log_so3(rotation)))),
     )
 
 

@@ -37,7 +37,6 @@ from loopcal.engine.program import (
     TwistRows,
 )
 from loopcal.errors import MissingPackageError
-from loopcal.findings import report_finding
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.version import __version__
 
@@ -113,8 +112,7 @@ def select_engine(choice: str = "") -> Engine:
         reason = "it belongs to another version of loopcal, or fails. Install both anew"
         if isinstance(cause, ImportError | OSError | ValueError):  # their texts say what to do
             reason = str(cause)
-        finding = report_finding("engine.not-usable", engine=choice, reason=reason)
-        raise MissingPackageError(finding) from cause
+        raise MissingPackageError.of("engine.not-usable", engine=choice, reason=reason) from cause
     return engine
 
 
@@ -147,7 +145,7 @@ def _find_loader(choice: str, name: str) -> Callable[[], Callable[[str], Engine]
     installed = {entry.name: entry for entry in entry_points(group=GROUP)}
     if name not in installed:
         known = (NUMPY, *sorted(installed))
-        raise MissingPackageError(report_finding("engine.unknown", engine=choice, known=known))
+        raise MissingPackageError.of("engine.unknown", engine=choice, known=known)
     return installed[name].load
 
 

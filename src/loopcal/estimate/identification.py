@@ -38,7 +38,6 @@ from loopcal.estimate.prior import refuse_reused_rows
 from loopcal.estimate.problem import Problem, problem_of, problem_of_trials
 from loopcal.estimate.residual_test import FEWEST_DEGREES
 from loopcal.estimate.result import Identification
-from loopcal.findings import report_finding
 from loopcal.measure.array_checks import check_type
 from loopcal.measure.data_checks import check_actuators, check_types
 from loopcal.measure.measurements import Measurements
@@ -96,13 +95,13 @@ def check_rows(problem: Problem, data: Measurements, robot: Mechanism) -> None:
     """Refuse readings of another robot, held-out poses, no free parameters, and no rows."""
     check_actuators(data, robot)
     if count := int(data.is_held_out.sum()):
-        raise DataError(report_finding("data.held-out-fitted", count=count))
+        raise DataError.of("data.held-out-fitted", count=count)
     if problem.parameters == 0:
-        raise EstimationError(
-            report_finding("fit.no-free-parameter", robot=robot.name, total=len(robot.parameters))
+        raise EstimationError.of(
+            "fit.no-free-parameter", robot=robot.name, total=len(robot.parameters)
         )
     if problem.residual_count[0] == 0:
-        raise EstimationError(report_finding("fit.no-measured-value"))
+        raise EstimationError.of("fit.no-measured-value")
 
 
 def check_count(problem: Problem, data: Measurements, options: FitOptions, z: FloatArray) -> None:
@@ -116,21 +115,17 @@ def check_count(problem: Problem, data: Measurements, options: FitOptions, z: Fl
     if m >= p or options.allow_fewer_equations or options.prior is not None:
         return
     if m == 0:
-        raise EstimationError(
-            report_finding("fit.no-equation-left", poses=data.n_poses, unknowns=p)
-        )
+        raise EstimationError.of("fit.no-equation-left", poses=data.n_poses, unknowns=p)
     if has_equations_to_spare(problem, z, method, options.rank_tolerance):
         return
-    raise EstimationError(
-        report_finding(
-            "fit.too-few-equations",
-            equations=m,
-            poses=data.n_poses,
-            unknowns=p,
-            nuisance=nuisance,
-            has_prior=required != problem.parameters,
-            poses_needed=int(np.ceil(p * data.n_poses / m)),
-        )
+    raise EstimationError.of(
+        "fit.too-few-equations",
+        equations=m,
+        poses=data.n_poses,
+        unknowns=p,
+        nuisance=nuisance,
+        has_prior=required != problem.parameters,
+        poses_needed=int(np.ceil(p * data.n_poses / m)),
     )
 
 
@@ -145,8 +140,8 @@ def refuse_start(problem: Problem, data: Measurements, deviation: FloatArray) ->
         for s, r in zip(problem.rows, residuals, strict=True)
         for i in s.poses_by_link[~(np.abs(r.whitened[0]) < HUGE).all(axis=1)].ravel()
     }
-    raise EstimationError(
-        report_finding("fit.residuals-not-finite", poses=tuple(data.labels[i] for i in sorted(bad)))
+    raise EstimationError.of(
+        "fit.residuals-not-finite", poses=tuple(data.labels[i] for i in sorted(bad))
     )
 
 

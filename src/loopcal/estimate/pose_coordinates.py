@@ -31,7 +31,6 @@ from loopcal.estimate.linearization import (
     spread_states,
 )
 from loopcal.estimate.observation_rows import ObservationRows, whiten
-from loopcal.findings import report_finding
 from loopcal.mechanism.actuation import DrivenJoints, differentiate_at_pose, solve_at_pose
 from loopcal.mechanism.assembly import Actuator
 from loopcal.mechanism.inverse import inverse_trials
@@ -213,7 +212,7 @@ class TwistCoordinates(PoseCoordinates):
         robot = free.robot
         drives = np.concatenate([g.actuator[g.actuator >= 0] for g in robot.program.groups])
         if len(drives) != robot.program.n_joints:
-            raise EstimationError(report_finding("poses.shared-actuators", robot=robot.name))
+            raise EstimationError.of("poses.shared-actuators", robot=robot.name)
         self.places: list[int] = list(robot.program.freedoms)
         self.count: int = len(self.places)
         self.scale: FloatArray = np.array([1.0 / robot.size] * 3 + [1.0] * 3)[self.places]

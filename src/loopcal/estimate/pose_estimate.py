@@ -247,7 +247,7 @@ def refuse_unreached(data: Measurements, lost: IntArray) -> None:
     if len(lost):
         names, total = tuple(data.labels[i] for i in lost), data.n_poses
         found = {"count": len(names), "total": total, "poses": names}
-        raise EstimationError(report_finding("fit.poses-out-of-reach", **found))
+        raise EstimationError.of("fit.poses-out-of-reach", **found)
 
 
 MOST = 0.5

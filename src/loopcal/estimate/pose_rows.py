@@ -51,7 +51,6 @@ from loopcal.estimate.linearization import (
 )
 from loopcal.estimate.observation_rows import ObservationRows, consecutive_pairs
 from loopcal.estimate.pose_coordinates import PoseCoordinates
-from loopcal.findings import report_finding
 from loopcal.measure.kinds.kind import Evaluation
 from loopcal.mechanism.actuation import drive_joints
 from loopcal.mechanism.kinematics import WIDE, is_square
@@ -726,10 +725,8 @@ def find_components(n: int, rows: Sequence[ObservationRows], coordinates: int) -
     largest = int(np.bincount(member).max())
     if largest * coordinates > LARGEST:
         unknowns = largest * coordinates
-        raise EstimationError(
-            report_finding(
-                "poses.chain-too-long", poses=largest, unknowns=unknowns, allowed=LARGEST
-            )
+        raise EstimationError.of(
+            "poses.chain-too-long", poses=largest, unknowns=unknowns, allowed=LARGEST
         )
     return member
 

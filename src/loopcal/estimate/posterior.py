@@ -19,7 +19,6 @@ from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.penalties import Method
 from loopcal.estimate.residual_test import FEWEST_DEGREES, ResidualTest
 from loopcal.estimate.smooth_errors import SmoothErrors
-from loopcal.findings import report_finding
 from loopcal.measure.fitted_rows import FittedRows, fitted_rows_from_arrays
 from loopcal.measure.kinds.setup_parameters import POSITION_AXES, ROTATION_AXES, linearize_frame
 from loopcal.mechanism.model import Mechanism
@@ -495,13 +494,11 @@ def posterior_from_arrays(robot: Mechanism, arrays: Mapping[str, np.ndarray]) ->
     EstimationError: it is a robot file, or its robot now has other free parameters.
     """
     if not arrays:
-        raise EstimationError(report_finding("prior.no-posterior"))
+        raise EstimationError.of("prior.no-posterior")
     unit, directions, variance, determined = (arrays[PREFIX + f.name] for f in Posterior.FIELDS)
     places = np.flatnonzero(robot.parameters.free)
     if len(places) != len(unit):
-        raise EstimationError(
-            report_finding("prior.other-count", identified=len(unit), free=len(places))
-        )
+        raise EstimationError.of("prior.other-count", identified=len(unit), free=len(places))
     roots, number = arrays[PREFIX + "root"], arrays[PREFIX + "part"]
     stated = zip(arrays[PREFIX + "source"].tolist(), arrays[PREFIX + "degrees"], strict=True)
     parts = tuple(

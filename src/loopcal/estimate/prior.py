@@ -22,7 +22,6 @@ from loopcal.errors import DataError, EstimationError, suggest_names
 from loopcal.estimate.linearization import Linearization, Start
 from loopcal.estimate.posterior import Posterior
 from loopcal.estimate.problem import Problem
-from loopcal.findings import report_finding
 from loopcal.measure.array_checks import check_type
 from loopcal.measure.fitted_rows import FittedRows
 from loopcal.measure.measurements import Measurements
@@ -175,7 +174,7 @@ def prior_from(earlier: Posterior) -> Prior:
     """
     check_type(earlier, Posterior, "earlier", "as identify(robot, data).posterior")
     if np.isnan(earlier.variance).any():
-        raise EstimationError(report_finding("prior.no-uncertainty"))
+        raise EstimationError.of("prior.no-uncertainty")
     known = np.isfinite(earlier.variance)
     whitening = np.diag(1.0 / np.sqrt(np.where(known, earlier.variance, 1.0)))[known]
     rows = np.linalg.solve(earlier.directions.T, whitening.T).T / earlier.unit
@@ -194,7 +193,7 @@ def refuse_reused_rows(earlier: Prior | Posterior | None, data: Measurements) ->
     reused = earlier.fitted_rows.find_in(data)
     if reused.count:
         others = reused.total - reused.count
-        raise DataError(report_finding("prior.rows-reused", **reused._asdict(), others=others))
+        raise DataError.of("prior.rows-reused", **reused._asdict(), others=others)
 
 
 def limb_parameters(robot: Mechanism, limb: str) -> tuple[str, ...]:

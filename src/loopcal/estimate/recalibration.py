@@ -127,7 +127,7 @@ def recalibrate(
     for name in (*prior.names, *free.names):
         if name not in prior.names or name not in free.names:
             place = "the earlier run" if name in prior.names else "the robot file"
-            raise EstimationError(report_finding("prior.other-parameters", name=name, place=place))
+            raise EstimationError.of("prior.other-parameters", name=name, place=place)
     names = prior.names if free_limb is None else limb_parameters(robot, free_limb)
     alone = replace(options, method=None, noise="given", allow_fewer_equations=True)
     later = identify(robot, data, options=alone, progress=progress)

@@ -11,7 +11,6 @@ from importlib import resources
 from pathlib import Path
 
 from loopcal.errors import DataError, FileError, suggest_names
-from loopcal.findings import report_finding
 from loopcal.io.core.outputs import replace_folder
 from loopcal.io.core.text_file import as_path, read_text
 
@@ -41,13 +40,12 @@ def write_example(name: str, path: str | Path) -> tuple[str, ...]:
     path, examples = as_path(path, "folder"), list_examples()
     if name not in examples:
         similar, known = suggest_names(name, list(examples)), tuple(examples)
-        finding = report_finding("files.no-example", name=name, similar=similar, examples=known)
-        raise DataError(finding)
+        raise DataError.of("files.no-example", name=name, similar=similar, examples=known)
     files = {file.name: file for file in sorted(examples[name].iterdir()) if file.is_file()}
 
     def refuse_existing(target: Path) -> None:
         if target.exists() and (not target.is_dir() or any(target.iterdir())):
-            raise FileError(report_finding("files.example-exists", name=name), path)
+            raise FileError.of("files.example-exists", path, name=name)
 
     refuse_existing(path)
     with replace_folder(path, refuse_existing, files) as folder:

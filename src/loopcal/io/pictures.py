@@ -577,9 +577,7 @@ def format_pictures(
     good = [picture for picture in pictures if picture.fault is None]
     if not good:
         name, reason = pictures[0].path.name, str(pictures[0].fault)
-        raise DataError(
-            report_finding("pictures.none", count=len(pictures), name=name, reason=reason)
-        )
+        raise DataError.of("pictures.none", count=len(pictures), name=name, reason=reason)
     focals = [picture.focal for picture in good if picture.focal is not None]
     focal = round(float(np.median(focals))) if focals else None
     camera = Image(mount=mount, corners=board.corners, square=board.square, size=good[0].size)

@@ -15,7 +15,6 @@ import numpy as np
 
 from loopcal import geometry
 from loopcal.errors import DataError
-from loopcal.findings import report_finding
 from loopcal.measure.array_checks import check_type
 from loopcal.measure.kinds import CLOSURE
 from loopcal.measure.kinds.joints import JointSensor
@@ -56,7 +55,7 @@ def check_closure(
     check_kinds(robot, kinds)
     is_closure = any(kind.name == CLOSURE for kind in kinds)
     if is_closure and resolve_reading_sigma(robot, reading_sigma, n_poses) is None:
-        raise DataError(report_finding("data.closure-without-sigma", robot=robot.name))
+        raise DataError.of("data.closure-without-sigma", robot=robot.name)
 
 
 def check_kinds(robot: Mechanism, kinds: Sequence[Kind]) -> None:
@@ -69,7 +68,7 @@ def check_kinds(robot: Mechanism, kinds: Sequence[Kind]) -> None:
             "freedoms": len(robot.freedoms),
         }
         code = "data.closure-without-redundancy"
-        raise DataError(report_finding(code, robot=robot.name, **counts))
+        raise DataError.of(code, robot=robot.name, **counts)
     known = list_joint_dimensions(robot)
     for kind in (kind for kind in kinds if isinstance(kind, JointSensor)):
         for joint in kind.joints:
@@ -93,7 +92,7 @@ def check_actuators(measurements: Measurements, robot: Mechanism) -> None:
     if columns != len(names):
         stated: dict[str, Any] = {"columns": columns, "robot": robot.name}
         stated |= {"actuators_count": len(names), "actuators": names}
-        raise DataError(report_finding("data.wrong-actuator-count", **stated))
+        raise DataError.of("data.wrong-actuator-count", **stated)
     kinds = [rows.kind for rows in measurements.observations]
     check_closure(robot, kinds, measurements.reading_sigma, measurements.n_poses)
 
@@ -146,7 +145,7 @@ def check_strokes(
     check_actuators(measurements, robot)
     described = None if allow else describe_outside_strokes(measurements, robot, places)
     if described is not None:
-        raise DataError(report_finding("data.outside-stroke", **described))
+        raise DataError.of("data.outside-stroke", **described)
 
 
 def check_duplicates(
@@ -189,9 +188,9 @@ def check_duplicates(
         where = tuple(lines[i] for i in pair) if lines else ()
         described: dict[str, Any] = {"kind": kind.name, "places": where, "more": len(copies) - 1}
         if kind.is_of_base:
-            raise DataError(report_finding("data.duplicate-base-rows", **described))
+            raise DataError.of("data.duplicate-base-rows", **described)
         labels = tuple(measurements.labels[poses[i, 0]] for i in pair)
-        raise DataError(report_finding("data.duplicate-rows", poses=labels, **described))
+        raise DataError.of("data.duplicate-rows", poses=labels, **described)
 
 
 def _list_compared_values(
@@ -257,7 +256,7 @@ def check_targets_move(measurements: Measurements, T: FloatArray, size: float) -
             if static.target not in kind.target_columns:
                 code = "conventions.column-never-changes"
                 stated = {"column": static.target, "kind": kind.name, "value": value}
-            raise DataError(report_finding(code, **stated, expected=planned))
+            raise DataError.of(code, **stated, expected=planned)
 
 
 def has_static_targets(measurements: Measurements) -> bool:

@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from loopcal.errors import DataError
-from loopcal.findings import report_finding
 from loopcal.measure.array_checks import (
     check_array,
     check_seed,
@@ -47,7 +46,7 @@ def _check_bodies(of_poses: Sequence[Observations], of_base: Sequence[Observatio
                 fault = "targets on the base. Pass them as `base_observations`, not `observations`"
             raise DataError(f"rows of kind {kind.name!r} measure {fault}")
         if kind.is_of_base and (shared := list_moving_targets(kind, kinds)):
-            raise DataError(report_finding("data.target-on-two-bodies", targets=shared))
+            raise DataError.of("data.target-on-two-bodies", targets=shared)
 
 
 def list_moving_targets(kind: Kind, others: Iterable[Kind]) -> tuple[str, ...]:
@@ -357,9 +356,7 @@ def _check_held_out(is_held_out: ArrayLike, block: IntArray, labels: tuple[str, 
         )
     for i in np.flatnonzero(mask & np.isin(block, block[~mask]))[:1]:
         j = np.flatnonzero((block == block[i]) & ~mask)[0]
-        raise DataError(
-            report_finding("data.block-partly-held-out", held_out=labels[i], fitted=labels[j])
-        )
+        raise DataError.of("data.block-partly-held-out", held_out=labels[i], fitted=labels[j])
     mask.setflags(write=False)
     return mask
 

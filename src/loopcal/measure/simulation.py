@@ -17,7 +17,6 @@ from numpy.typing import ArrayLike
 
 from loopcal.engine import State
 from loopcal.errors import DataError
-from loopcal.findings import report_finding
 from loopcal.measure.array_checks import check_array, check_type, refuse_first
 from loopcal.measure.data_checks import check_closure, check_kinds
 from loopcal.measure.initial_values import EvaluatedRows, evaluate_measurements
@@ -329,13 +328,11 @@ def simulate_trials(
                 "T_board"
             )
         for _, problem in kind.find_invalid_rows(np.concatenate(columns)):
-            raise DataError(
-                report_finding(
-                    "data.simulated-row-impossible",
-                    kind=kind.name,
-                    robot=robot.name,
-                    problem=problem.partition(";")[0],
-                )
+            raise DataError.of(
+                "data.simulated-row-impossible",
+                kind=kind.name,
+                robot=robot.name,
+                problem=problem.partition(";")[0],
             )
         if not kind.is_of_base:
             complete = np.all(reached[:, rows].reshape(len(reached), len(rows), -1), axis=-1)

@@ -483,13 +483,12 @@ def _refuse_singular_start(robot: Mechanism, target: FloatArray) -> None:
             if abs(value - joint.start) > STRETCHED * (robot.size if joint.kind == "P" else 1.0)
         ]
         if found:
-            finding = report_finding(
+            raise MechanismError.of(
                 "mechanism.singular-start",
                 name=robot.name,
                 joints=tuple(name for name, _, _ in found),
                 values=tuple(robot.to_quantity(value, d) for _, d, value in found),
             )
-            raise MechanismError(finding)
 
 
 def _build_chain(assembly: Assembly, units: Mapping[Dimension, str], record: Any) -> Mechanism:
@@ -617,23 +616,16 @@ def _check_drives_of_pose(robot: Mechanism) -> None:
     freedoms = count_rank(scaled)
     c, a = len(robot.controlled), len(moving)
     if not freedoms <= c <= a:
-        raise MechanismError(
-            report_finding(
-                "mechanism.chain-controlled",
-                name=robot.name,
-                named=c,
-                actuators=a,
-                freedoms=freedoms,
-            )
+        raise MechanismError.of(
+            "mechanism.chain-controlled", name=robot.name, named=c, actuators=a, freedoms=freedoms
         )
     slope = differentiate_coordinates(home.T[0], robot.controlled, robot.size)
     rates = slope[0] / robot.twist_scale @ scaled
     independent = count_rank(rates)
     if independent < c:
-        finding = report_finding(
+        raise MechanismError.of(
             "mechanism.chain-singular-home",
             name=robot.name,
             controlled=robot.controlled,
             independent=independent,
         )
-        raise MechanismError(finding)

@@ -11,7 +11,6 @@ import numpy as np
 from loopcal import engine
 from loopcal.engine import ENDINGS
 from loopcal.errors import MechanismError
-from loopcal.findings import report_finding
 from loopcal.mechanism.actuation import list_open_sums, measure_sums
 from loopcal.mechanism.assembly import (
     AXES,
@@ -64,13 +63,13 @@ def check_mobility(robot: Mechanism) -> Mechanism:
         if not np.isfinite(A).all()
     ]
     if lost:
-        raise MechanismError(report_finding("mechanism.no-direction", name=robot.name, limbs=lost))
+        raise MechanismError.of("mechanism.no-direction", name=robot.name, limbs=lost)
     refuse_free_bodies(robot, home)
     closure, names = stack_scaled_rows(robot, blocks)[0, 0], [AXES[f] for f in program.freedoms]
     m, a, M = len(names), program.n_joints, len(program.unknown_twists)
     free = find_null_space(closure[:, :M], RANK)
     if free.size:
-        finding = report_finding(
+        raise MechanismError.of(
             "mechanism.free-platform",
             name=robot.name,
             motion=tuple(list_main_freedoms(names, free[:m, 0])),
@@ -78,7 +77,6 @@ def check_mobility(robot: Mechanism) -> Mechanism:
             rank=m - free.shape[1],
             freedoms=m,
         )
-        raise MechanismError(finding)
     rows = closure
     if robot.assembly.couplings:
         sums = list_open_sums(robot, robot.values[None])
@@ -89,7 +87,7 @@ def check_mobility(robot: Mechanism) -> Mechanism:
     motions = find_null_space(rows, RANK)[:m]
     movable = motions.shape[1]
     if movable < min(a, m):
-        finding = report_finding(
+        raise MechanismError.of(
             "mechanism.over-constrained",
             name=robot.name,
             actuators=a,
@@ -99,7 +97,6 @@ def check_mobility(robot: Mechanism) -> Mechanism:
                 tuple(list_main_freedoms(names, y)) for y in find_null_space(motions.T, RANK).T
             ),
         )
-        raise MechanismError(finding)
     if len(robot.controlled) != movable:
         raise MechanismError(
             f"{robot.name} moves in {movable} freedoms, but names "
@@ -123,13 +120,12 @@ def refuse_free_bodies(robot: Mechanism, state: engine.State) -> None:
         node, _ = columns[m + int(np.abs(motion).argmax())]
         own = [i for i, (other, _) in enumerate(columns[m:]) if other == node]
         names = [AXES[columns[m + i][1]] for i in own]
-        finding = report_finding(
+        raise MechanismError.of(
             "mechanism.free-body",
             name=robot.name,
             body=tuple(robot.assembly.bodies)[node - 1],
             motion=tuple(list_main_freedoms(names, motion[own])),
         )
-        raise MechanismError(finding)
 
 
 def _check_open_sums(robot: Mechanism, rows: FloatArray) -> bool:
@@ -170,12 +166,11 @@ def refuse_singular_home(robot: Mechanism, state: engine.State) -> None:
     motion = np.linalg.norm(rows[:, len(robot.program.unknown_twists) :], axis=0)
     names = robot.assembly.driven_joints
     is_idle = motion < STRETCHED * robot.joint_units
-    finding = report_finding(
+    raise MechanismError.of(
         "mechanism.singular-home",
         name=robot.name,
         actuators=tuple(name for name, idle in zip(names, is_idle, strict=True) if idle),
     )
-    raise MechanismError(finding)
 
 
 def _differentiate_controlled(robot: Mechanism, T: FloatArray) -> FloatArray:

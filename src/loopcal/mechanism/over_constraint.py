@@ -274,7 +274,7 @@ def refuse_breaking_parameters(robot: Mechanism, drawn: bool = False) -> None:
     if names:
         assert finding is not None
         repeated = finding.data["repeated"]
-        raise MechanismError(report_finding(code, name=robot.name, names=names, repeated=repeated))
+        raise MechanismError.of(code, name=robot.name, names=names, repeated=repeated)
 
 
 def find_breaking_parameters(robot: Mechanism) -> tuple[str, ...]:

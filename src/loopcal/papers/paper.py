@@ -21,7 +21,6 @@ from typing import TYPE_CHECKING, Any
 
 from loopcal.errors import DataError, MechanismError, suggest_names
 from loopcal.estimate.free_parameters import select_free_parameters
-from loopcal.findings import report_finding
 from loopcal.findings.wording import list_names, round_to_digits
 from loopcal.io.core.yaml_file import format_yaml, parse_yaml, quote_scalar
 from loopcal.io.robot.robot_file import find_robot_file, load_robot
@@ -101,7 +100,7 @@ class Paper:
             check_legs(other)
         table = other.parameters
         if not (table.free * [bool(entry.tolerance) for entry in table.entries]).any():
-            raise DataError(report_finding("data.no-errors-drawn", robot=other.name))
+            raise DataError.of("data.no-errors-drawn", robot=other.name)
         return StudyCase(self, str(robot), other, epsilon)
 
     def present(

@@ -111,7 +111,7 @@ def choose_stations(
     DataError : the camera is on the platform, sees no board, or promises no bounded error.
     """
     if camera.mount != "board":
-        raise DataError(report_finding("plan.camera-mounted", robot=robot.name))
+        raise DataError.of("plan.camera-mounted", robot=robot.name)
     options = replace(options or PlanOptions(), allow_fewer_equations=True)
     camera, stated = state_camera(camera, scales)
     candidates, sight = draw_candidates(robot, options.constraints, DRAWN, options.seed), None
@@ -133,7 +133,7 @@ def choose_stations(
                 errors[i] = np.inf if after is None else after.select(options.target)
             progress(i + 1, len(usable), "stations of the camera")
         if not np.isfinite(errors).any():
-            raise DataError(report_finding("plan.no-station", robot=robot.name))
+            raise DataError.of("plan.no-station", robot=robot.name)
         chosen.append(usable[int(np.flatnonzero(errors <= (1.0 + ALIKE) * errors.min())[0])])
         sight = None
     return _equip(chosen, stated), tuple(_describe(robot, view) for view in chosen)
@@ -147,7 +147,7 @@ def _select_usable(views: Sequence[View]) -> list[View]:
         shown = 100.0 * float(best.shown.mean())
         pixels, tilt = float(np.median(best.pixels)), float(np.median(best.tilt))
         data: dict[str, Any] = {"shown": shown, "pixels": max(pixels, 0.0), "tilt": tilt}
-        raise DataError(report_finding("plan.board-unseen", **data))
+        raise DataError.of("plan.board-unseen", **data)
     return [view for view in usable if view.pixels.min() >= CLEAR] or usable
 
 

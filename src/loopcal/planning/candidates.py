@@ -86,9 +86,7 @@ def draw_candidates(
         kept, n_drawn = kept + len(batches[-1]), n_drawn + len(poses)
         if n_drawn >= MIN_DRAWS and kept < MIN_REACHABLE_SHARE * n_drawn:
             counts = {"allowed": kept, "total": n_drawn, "reasons": list_reasons(excluded)}
-            raise MechanismError(
-                report_finding("plan.workspace-excluded", robot=robot.name, **counts)
-            )
+            raise MechanismError.of("plan.workspace-excluded", robot=robot.name, **counts)
     inside = np.concatenate(batches)
     edge = _draw_boundary(checker, rng, bounds, count // 2, inside)
     poses = np.concatenate([inside, edge])
@@ -108,9 +106,7 @@ def check_listed_poses(
     excluded, good = check.count_violations(), poses[check.allowed]
     if not len(good):
         counts = {"total": len(poses), "reasons": list_reasons(excluded)}
-        raise MechanismError(
-            report_finding("plan.listed-poses-excluded", robot=robot.name, **counts)
-        )
+        raise MechanismError.of("plan.listed-poses-excluded", robot=robot.name, **counts)
     return _keep_reachable(checker, good, np.ones(len(good), dtype=bool), excluded, len(poses))
 
 
@@ -149,7 +145,7 @@ def _refuse_home(
 ) -> MechanismError:
     """Return the error of a home that no path of a plan can leave."""
     facts = {"robot": robot.name, "reasons": list_reasons(counts), "is_isolated": is_isolated}
-    return MechanismError(report_finding("plan.home-excluded", **facts))
+    return MechanismError.of("plan.home-excluded", **facts)
 
 
 def _draw_boundary(

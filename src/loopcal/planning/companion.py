@@ -138,9 +138,7 @@ def prepare_task(
     solution = forward(robot, planned.readings)
     if not solution.converged.all():
         label = planned.labels[int(np.flatnonzero(~solution.converged)[0])]
-        raise DataError(
-            report_finding("plan.measured-pose-unreachable", robot=robot.name, pose=label)
-        )
+        raise DataError.of("plan.measured-pose-unreachable", robot=robot.name, pose=label)
     coordinates, n = read_coordinates(solution.T, robot.controlled), planned.n_poses
     checker = build_checker(robot, options.constraints)
     candidates = Candidates(coordinates, solution, np.ones(n, dtype=bool), Counter(), n, checker)

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from loopcal.checks import NOT_NEGATIVE, POSITIVE, Limit, Limited
 from loopcal.errors import DataError
-from loopcal.findings import report_finding
 from loopcal.measure.array_checks import check_array
 from loopcal.measure.measurements import Measurements
 from loopcal.mechanism.model import Mechanism
@@ -221,18 +220,14 @@ def build_checker(robot: Mechanism, constraints: Constraints | None) -> Constrai
             if a.dimension is dimension and a.stroke is not None
         }
         if not strokes:
-            raise DataError(
-                report_finding("plan.no-stroke", robot=robot.name, dimension=dimension.value)
-            )
+            raise DataError.of("plan.no-stroke", robot=robot.name, dimension=dimension.value)
         name = min(strokes, key=strokes.__getitem__)
         if not 2.0 * margin < strokes[name]:
-            raise DataError(
-                report_finding(
-                    "plan.margin-exceeds-stroke",
-                    actuator=name,
-                    margin=robot.to_quantity(margin, dimension),
-                    stroke=robot.to_quantity(strokes[name], dimension),
-                )
+            raise DataError.of(
+                "plan.margin-exceeds-stroke",
+                actuator=name,
+                margin=robot.to_quantity(margin, dimension),
+                stroke=robot.to_quantity(strokes[name], dimension),
             )
     return ConstraintChecker(robot, required, compute_median_margins(robot))
 

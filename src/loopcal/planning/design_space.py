@@ -19,7 +19,6 @@ from numpy.typing import ArrayLike
 
 from loopcal import engine
 from loopcal.errors import EstimationError
-from loopcal.findings import report_finding
 from loopcal.numerics.decomposition import are_nonzero
 from loopcal.numerics.elimination import eliminate_from_triangle
 from loopcal.typing import BoolArray, FloatArray, IntArray
@@ -237,21 +236,19 @@ class DesignProblem:
         """Refuse a number of groups that cannot determine all directions."""
         count = len(self.allowed)
         if count == 0:
-            raise EstimationError(report_finding("plan.no-candidate-allowed", total=len(self.rows)))
+            raise EstimationError.of("plan.no-candidate-allowed", total=len(self.rows))
         if len(self.space) == 0:
-            raise EstimationError(report_finding("plan.no-direction-observable"))
+            raise EstimationError.of("plan.no-direction-observable")
         if n > count and not self.repeats:
             counts = {"requested": n, "what": self.counted, "available": count}
-            raise EstimationError(report_finding("plan.too-few-candidates", **counts))
+            raise EstimationError.of("plan.too-few-candidates", **counts)
         if n < self.n_needed:
-            raise EstimationError(
-                report_finding(
-                    "plan.design-too-small",
-                    requested=n,
-                    equations=n * self.rows.shape[1],
-                    unknowns=self.n_unknowns,
-                    needed=self.n_needed,
-                )
+            raise EstimationError.of(
+                "plan.design-too-small",
+                requested=n,
+                equations=n * self.rows.shape[1],
+                unknowns=self.n_unknowns,
+                needed=self.n_needed,
             )
 
     def build_scoring(self, n: int) -> Scoring:
@@ -273,7 +270,7 @@ class DesignProblem:
                 L = criterion.weights @ space.machine / np.sqrt(criterion.count)
             prediction = factor_rows(divide_by_factor(L, inner))
             if not prediction.any():
-                raise EstimationError(report_finding("plan.prediction-unobservable"))
+                raise EstimationError.of("plan.prediction-unobservable")
         offset = float(2.0 * np.log(np.abs(np.diagonal(inner))).sum())
         return Scoring(space, transform, factor_rows(prior.rows @ transform), prediction, offset)
 

@@ -41,7 +41,6 @@ from typing import Any
 import numpy as np
 
 from loopcal.errors import EstimationError
-from loopcal.findings import report_finding
 from loopcal.planning.design_space import (
     Criterion,
     DesignProblem,
@@ -334,7 +333,7 @@ def _require_determined(score: float, n: int, count: int, space: ObservableSpace
     """Refuse the best of n of `count` groups where its score says that it is singular."""
     if not np.isfinite(score):
         counts: dict[str, Any] = {"chosen": n, "available": count, "unknowns": space.n_unknowns}
-        raise EstimationError(report_finding("plan.design-singular", **counts))
+        raise EstimationError.of("plan.design-singular", **counts)
 
 
 def exchange_from_start(
@@ -521,11 +520,11 @@ def find_smallest_design(
     numbers = {"size": most, "available": count, "criterion": name, "target": target}
     if at_least > most:
         best = bounds[most]
-        raise EstimationError(report_finding("plan.target-impossible", best=best, **numbers))
+        raise EstimationError.of("plan.target-impossible", best=best, **numbers)
     n = search_size(make, at_least, most)
     if n > most:
         best = made[most].value
-        raise EstimationError(report_finding("plan.target-not-reached", best=best, **numbers))
+        raise EstimationError.of("plan.target-not-reached", best=best, **numbers)
     if evaluate is not None:
         at_least = find_least(made[n].value, at_least, n)
     return made[n], at_least

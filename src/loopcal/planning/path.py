@@ -23,7 +23,6 @@ import numpy as np
 
 from loopcal import geometry
 from loopcal.errors import MechanismError
-from loopcal.findings import report_finding
 from loopcal.mechanism.chains import has_spare_drives
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import TILT, list_dimensions, read_coordinates
@@ -267,7 +266,7 @@ def check_route(robot: Mechanism, labels: Sequence[str], coordinates: FloatArray
         i = int(np.flatnonzero(~check.allowed)[0])
         names = ("home", *labels, "home")
         reasons = list_reasons(Counter([check.violations[i]]))
-        raise MechanismError(
-            report_finding("plan.route-blocked", first=names[i], last=names[i + 1], reasons=reasons)
+        raise MechanismError.of(
+            "plan.route-blocked", first=names[i], last=names[i + 1], reasons=reasons
         )
     return home

@@ -89,8 +89,8 @@ class PlaneLineGroups(Limited):
         super().__post_init__()
         missing = tuple(name for name in POSITION if name not in self.robot.controlled)
         if missing:
-            raise EstimationError(
-                report_finding("plan.surfaces-not-followed", robot=self.robot.name, missing=missing)
+            raise EstimationError.of(
+                "plan.surfaces-not-followed", robot=self.robot.name, missing=missing
             )
 
     @cached_property
@@ -133,8 +133,8 @@ class PlaneLineGroups(Limited):
             left = left[np.isnan(self.linearize(new)).any(axis=(1, 2))]
             if not len(left):
                 return design
-        raise EstimationError(
-            report_finding("plan.surfaces-out-of-reach", robot=self.robot.name, points=self.points)
+        raise EstimationError.of(
+            "plan.surfaces-out-of-reach", robot=self.robot.name, points=self.points
         )
 
     def place_points(self, design: FloatArray) -> FloatArray:
@@ -483,10 +483,8 @@ def _arrange_points(
     if not from_home.allowed.all():
         isolated = int((~from_home.allowed).sum())
         reasons = list_reasons(from_home.count_violations())
-        raise EstimationError(
-            report_finding(
-                "plan.points-isolated", isolated=isolated, points=len(flat), reasons=reasons
-            )
+        raise EstimationError.of(
+            "plan.points-isolated", isolated=isolated, points=len(flat), reasons=reasons
         )
     solution = inverse(groups.robot, flat)
     poses = PlannedPoses(
@@ -522,14 +520,12 @@ def _draw_allowed(
         if total >= DRAWN * enough:
             poses = groups.place_points(new).reshape(-1, len(groups.robot.controlled))
             check = checker.check_poses(inverse(groups.robot, poses))
-            raise EstimationError(
-                report_finding(
-                    "plan.groups-excluded",
-                    allowed=sum(map(len, designs)),
-                    total=total,
-                    points=groups.points,
-                    reasons=list_reasons(check.count_violations()),
-                )
+            raise EstimationError.of(
+                "plan.groups-excluded",
+                allowed=sum(map(len, designs)),
+                total=total,
+                points=groups.points,
+                reasons=list_reasons(check.count_violations()),
             )
     return np.concatenate(designs), np.concatenate(rows)
 

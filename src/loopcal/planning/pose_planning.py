@@ -341,14 +341,12 @@ def plan_poses(problem: PlanningProblem, progress: Progress = report_no_progress
         if result.errors.after.select(options.target) <= options.goal:
             return replace(result, curve=replace(curve, enough=n))
         n += max(n // 20, 1)
-    raise EstimationError(
-        report_finding(
-            "plan.goal-missed",
-            number=n,
-            counted=problem.counted,
-            criterion=options.criterion,
-            expected=curve.enough,
-        )
+    raise EstimationError.of(
+        "plan.goal-missed",
+        number=n,
+        counted=problem.counted,
+        criterion=options.criterion,
+        expected=curve.enough,
     )
 
 
@@ -421,14 +419,12 @@ def _draw_held_out(problem: PlanningProblem, count: int, drawn: IntArray) -> Int
             chosen.append(group)
             used.update(poses)
     if len(chosen) < count:
-        raise EstimationError(
-            report_finding(
-                "plan.too-few-held-out",
-                requested=count,
-                counted=problem.counted,
-                candidates=len(problem.candidates),
-                available=len(chosen),
-            )
+        raise EstimationError.of(
+            "plan.too-few-held-out",
+            requested=count,
+            counted=problem.counted,
+            candidates=len(problem.candidates),
+            available=len(chosen),
         )
     return np.array(chosen, dtype=np.int64)
 

@@ -142,8 +142,8 @@ def linearize_prediction(
     )
     if chosen.undetermined and free.assumed.any():
         missing = int(free.assumed.sum())
-        raise EstimationError(
-            report_finding("plan.frame-unbounded", frames=chosen.undetermined, missing=missing)
+        raise EstimationError.of(
+            "plan.frame-unbounded", frames=chosen.undetermined, missing=missing
         )
     kept = transport(free.robot, T, "base", "tool") @ chosen.relate(twists, T)
     return Prediction(kept[:, :3], kept[:, 3:], free.robot.size, chosen)
@@ -251,8 +251,8 @@ class PlanningProblem:
             scale = self.prediction.size
         largest = float(np.abs(self.prediction.pose).max(initial=0.0))
         if target != "pose" and not scale * np.abs(rows).max(initial=0.0) > NO_MOTION * largest:
-            raise EstimationError(
-                report_finding("plan.target-unobservable", robot=self.robot.name, target=target)
+            raise EstimationError.of(
+                "plan.target-unobservable", robot=self.robot.name, target=target
             )
         return Criterion("I", rows, len(self.prediction))
 
@@ -285,16 +285,14 @@ class PlanningProblem:
         """Refuse n groups that give fewer equations than there are unknowns."""
         k = self.poses_per_group
         if n < self.min_groups and not self.options.allow_fewer_equations:
-            raise EstimationError(
-                report_finding(
-                    "plan.too-few-equations",
-                    robot=self.robot.name,
-                    poses=n * k,
-                    equations=n * self.groups.rows.shape[1],
-                    earlier=self.n_earlier_equations,
-                    unknowns=self.n_unknowns,
-                    needed=self.min_groups * k,
-                )
+            raise EstimationError.of(
+                "plan.too-few-equations",
+                robot=self.robot.name,
+                poses=n * k,
+                equations=n * self.groups.rows.shape[1],
+                earlier=self.n_earlier_equations,
+                unknowns=self.n_unknowns,
+                needed=self.min_groups * k,
             )
 
 
@@ -317,7 +315,7 @@ def prepare_problem(
     check_type(options, PlanOptions, "options", "such as PlanOptions(n_poses=30)")
     free = select_free_parameters(robot)
     if not len(free):
-        raise EstimationError(report_finding("plan.no-free-parameter", robot=robot.name))
+        raise EstimationError.of("plan.no-free-parameter", robot=robot.name)
     _require_plain_sensors(instrument)
     check_closure(robot, [sensor.kind for sensor in instrument.sensors], None, 1)
     rng = np.random.default_rng(options.seed)
@@ -329,14 +327,12 @@ def prepare_problem(
     groups = linearize_candidate_groups(free, mounted, candidates.solution.q, rng)
     observable = decompose_information(groups)
     if not observable.singular_values.max(initial=0.0) > NO_INFORMATION:
-        raise EstimationError(
-            report_finding(
-                "plan.nothing-observable",
-                robot=robot.name,
-                kinds=tuple(sensor.kind.name for sensor in mounted.sensors),
-                parameters=len(free),
-                poses=len(candidates),
-            )
+        raise EstimationError.of(
+            "plan.nothing-observable",
+            robot=robot.name,
+            kinds=tuple(sensor.kind.name for sensor in mounted.sensors),
+            parameters=len(free),
+            poses=len(candidates),
         )
     earlier, n_equations, labels = None, 0, ()
     to_predict = _select_predicted(candidates, options)
@@ -394,13 +390,11 @@ def _fold_measured(free: FreeParameters, measured: Measurements) -> tuple[FloatA
     robot = free.robot
     check_actuators(measured, robot)
     if not any(rows.is_measured.any() for rows in measured.observations):
-        raise DataError(report_finding("plan.measured-empty"))
+        raise DataError.of("plan.measured-empty")
     factor, reached = collect_information(free, measured)
     if not reached.all():
         label = measured.labels[int(np.flatnonzero(~reached)[0])]
-        raise DataError(
-            report_finding("plan.measured-pose-unreachable", robot=robot.name, pose=label)
-        )
+        raise DataError.of("plan.measured-pose-unreachable", robot=robot.name, pose=label)
     table = measured.nuisance_parameters.table
     nuisance = int((table.free & np.isnan(table.tolerance)).sum())
     n_equations = max(count_equations(robot, measured) - nuisance, 0)
@@ -528,18 +522,16 @@ def find_sample_size(
             raise
         (last,) = compute_design_curve(design, [most], options.seed, 0)
         reached, bound = (np.sqrt(v) for v in (evaluate(last.chosen), last.relaxed.bound))
-        raise EstimationError(
-            report_finding(
-                "plan.goal-unreachable",
-                share=options.share,
-                target=target,
-                goal=robot.to_quantity(goal, dimension),
-                number=most,
-                counted=problem.counted,
-                candidates=count,
-                best=robot.to_quantity(float(reached), dimension),
-                bound=robot.to_quantity(float(bound), dimension),
-            )
+        raise EstimationError.of(
+            "plan.goal-unreachable",
+            share=options.share,
+            target=target,
+            goal=robot.to_quantity(goal, dimension),
+            number=most,
+            counted=problem.counted,
+            candidates=count,
+            best=robot.to_quantity(float(reached), dimension),
+            bound=robot.to_quantity(float(bound), dimension),
         ) from None
     n = max(len(best.chosen), problem.min_groups)
     others = np.geomspace(problem.min_groups, min(2 * n, count), SIZES - 1).round().astype(int)

@@ -16,7 +16,6 @@ from typing import Any, ClassVar, Generic, Protocol, TypeVar
 from loopcal.checks import POSITIVE, Limit, Limited
 from loopcal.environment import import_optional, pin_processes
 from loopcal.errors import StudyError
-from loopcal.findings import report_finding
 
 # Workers that one task may stop. After that it is given up, because it stops any worker.
 MOST_LOSSES = 5
@@ -277,15 +276,13 @@ class Dask(_PooledExecutor):
         try:
             client = distributed.Client(address, timeout=patience, set_as_default=False)
         except (OSError, ValueError) as error:
-            finding = report_finding("workers.cluster-not-reached", address=address)
-            raise StudyError(finding) from error
+            raise StudyError.of("workers.cluster-not-reached", address=address) from error
         try:
             try:
                 client.wait_for_workers(1, timeout=patience)
             except TimeoutError:
                 code = "workers.cluster-without-workers"
-                finding = report_finding(code, address=address, seconds=patience)
-                raise StudyError(finding) from None
+                raise StudyError.of(code, address=address, seconds=patience) from None
             yield _DaskPool(distributed, client, address)
         finally:
             with suppress(OSError, TimeoutError):
@@ -333,7 +330,7 @@ class _DaskPool:
 
 def _report_lost(address: str) -> StudyError:
     """Return the error of a scheduler that has ended."""
-    return StudyError(report_finding("workers.cluster-lost", address=address))
+    return StudyError.of("workers.cluster-lost", address=address)
 
 
 @dataclass(frozen=True)
@@ -366,8 +363,9 @@ class Ray(_PooledExecutor):
             try:
                 ray.init(address=address, **settings)
             except (ConnectionError, RuntimeError, ValueError) as error:
-                finding = report_finding("workers.cluster-not-reached", address=address or "ray")
-                raise StudyError(finding) from error
+                raise StudyError.of(
+                    "workers.cluster-not-reached", address=address or "ray"
+                ) from error
         pool = _RayPool(ray)
         try:
             yield pool

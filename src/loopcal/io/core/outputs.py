@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from loopcal.errors import FileError
-from loopcal.findings import report_finding
 from loopcal.io.core.limits import TABLE_SIZE
 from loopcal.io.core.text_file import (
     convert_document,
@@ -71,12 +70,12 @@ def refuse_outputs(
         if not os.access(folder, os.W_OK):
             raise FileError("cannot write here (permission denied). Choose another folder", path)
         if path.is_file() and not force:
-            raise FileError(report_finding("files.output-exists"), path)
+            raise FileError.of("files.output-exists", path)
         if not force:  # another command may take the name before this one has its result
             note_output(path, resolve_target(path), None)
         document = _read_document(path) if path.suffix == ".json" and path.is_file() else None
         if isinstance((document or {}).get(FILES), dict):  # that of a result folder
-            raise FileError(report_finding("files.output-in-result"), path)
+            raise FileError.of("files.output-in-result", path)
 
 
 @contextmanager
@@ -158,8 +157,7 @@ def refuse_folder(path: Path, kind: FolderKind, force: bool, inputs: Sequence[Pa
         is_mount = target.is_mount()
         if is_mount or Path.cwd().is_relative_to(target):
             example = str(path / "result")
-            finding = report_finding("files.folder-in-place", is_mount=is_mount, example=example)
-            raise FileError(finding, path)
+            raise FileError.of("files.folder-in-place", path, is_mount=is_mount, example=example)
         parent = next(folder for folder in target.parents if folder.exists())
         if not parent.is_dir():
             sentence = f"cannot write here: {parent} is not a folder. Choose another place"
@@ -172,8 +170,7 @@ def refuse_folder(path: Path, kind: FolderKind, force: bool, inputs: Sequence[Pa
                 raise FileError(f"{sentence}. Choose another name", path)
         if target.is_dir() and any(target.iterdir()):
             if not force:
-                finding = report_finding("files.folder-in-use", content=kind.content)
-                raise FileError(finding, path)
+                raise FileError.of("files.folder-in-use", path, content=kind.content)
             _refuse_other_content(path, kind)
             places = (place for place, _, _ in os.walk(target))  # gone where another command writes
             if any(os.path.lexists(p) and not os.access(p, os.W_OK | os.X_OK) for p in places):
@@ -189,8 +186,7 @@ def _refuse_other_content(path: Path, kind: FolderKind) -> None:
                 document = _read_document(path / kind.document) or {}
                 listed = _list_digests(document)
                 if not listed or any(key not in document for key in kind.keys):
-                    finding = report_finding("files.folder-of-others", content=kind.content)
-                    raise FileError(finding, path)
+                    raise FileError.of("files.folder-of-others", path, content=kind.content)
                 names = list(_list_entries(path))
                 foreign = [name for name in names if not _is_expected(path, name, kind, listed)]
                 code, wrong = "files.foreign-files", foreign
@@ -198,8 +194,7 @@ def _refuse_other_content(path: Path, kind: FolderKind) -> None:
                     code = "files.changed-files"
                     wrong = [name for name in names if _is_changed(path, name, kind, listed)]
                 if wrong:
-                    finding = report_finding(code, content=kind.content, files=tuple(wrong))
-                    raise FileError(finding, path)
+                    raise FileError.of(code, path, content=kind.content, files=tuple(wrong))
                 return
             except (FileError, OSError):
                 if is_same():

@@ -31,7 +31,6 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from loopcal.errors import DataError, FileError, LoopcalError
-from loopcal.findings import report_finding
 from loopcal.io.core.limits import JSON_DEPTH, JSON_VALUES, PROGRAM_SIZE, FileLimit
 from loopcal.output_record import identify, note_output, record_outputs, was_free
 from loopcal.plain_text import escape_json
@@ -488,7 +487,7 @@ def _take_new_name(temporary: Path, target: Path, path: str | Path) -> None:
         except OSError:  # the file system has no second names
             os.close(os.open(target, os.O_WRONLY | os.O_CREAT | os.O_EXCL))
     except FileExistsError:
-        raise FileError(report_finding("files.output-exists"), path) from None
+        raise FileError.of("files.output-exists", path) from None
 
 
 @contextmanager

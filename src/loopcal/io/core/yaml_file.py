@@ -91,8 +91,8 @@ def parse_yaml(text: str, path: str | Path, what: str, has_names: bool = True) -
         is_ours = not has_names or _KNOWN_KEY.search(text) is not None
         if is_ours or error.code == "files.limit-exceeded":  # which only has numbers
             raise
-        finding = report_finding("files.not-recognized", what=what)  # shows nothing of the text
-        raise FileError(finding, path, error.line) from None
+        # the sentence shows nothing of the text
+        raise FileError.of("files.not-recognized", path, error.line, what=what) from None
     if not isinstance(content, dict):
         sentence = f"this {what} contains no 'key: value' lines. See the examples of loopcal"
         raise FileError(sentence, path)
@@ -153,8 +153,7 @@ def refuse_unknown_keys(
 ) -> None:
     """Raise FileError for the first key that is not allowed, with the nearest allowed names."""
     if set(keys).isdisjoint(allowed) and keys and not _KNOWN_KEY.search(file.text):
-        finding = report_finding("files.no-known-key", keys=tuple(sorted(allowed)))
-        raise FileError(finding, file.path)
+        raise FileError.of("files.no-known-key", file.path, keys=tuple(sorted(allowed)))
     for key in keys:
         if key not in allowed:
             hint = suggest_names(key, allowed) or f". Allowed: {', '.join(sorted(allowed))}"

@@ -133,13 +133,14 @@ def read_lines(
             continue
         for other, mark in DELIMITERS.items() if header is None else ():
             if named <= set(map(normalize_name, _split(line, mark))):
-                finding = report_finding(
+                raise FileError.of(
                     "files.export-separator",
+                    path,
+                    number,
                     profile=str(profile.file.path),
                     found=other,
                     wanted=record.delimiter,
                 )
-                raise FileError(finding, path, number)
         count = len(named & set(names))
         if nearest is None or count > nearest[0]:
             nearest = (count, number, names)
@@ -178,13 +179,14 @@ def _refuse_header(
         same = known.get(name.casefold())
         close = f" (did you mean {same!r}?)" if same else suggest_names(name, known.values())
         missing.append(f"{name!r}{close}")
-    finding = report_finding(
+    raise FileError.of(
         "files.export-column-missing",
+        path,
+        number,
         profile=str(profile.file.path),
         missing=tuple(missing),
         columns=tuple(quote(cell)[1:-1] for cell in cells if cell),
     )
-    raise FileError(finding, path, number)
 
 
 def check_count(line: Line, delimiter: str | None) -> None:
@@ -602,7 +604,7 @@ def fill_sheet(
     if not filled:
         wanted = [name_point(p, t, targets) for p in table.pose_names() for t in targets]
         facts: dict[str, Any] = {"exported": _shorten(unknown), "wanted": _shorten(wanted)}
-        raise FileError(report_finding("sheet.no-name-matches", **facts), Path(exports[0]))
+        raise FileError.of("sheet.no-name-matches", Path(exports[0]), **facts)
     findings = _report_counts(table, filled, targets)
     for code, names in (("points-unknown", unknown), ("points-identical", identical)):
         if names:
@@ -636,7 +638,7 @@ def read_sheet(path: Path, robot: Mechanism) -> tuple[Table, KindRows]:
     kinds = read_kinds(table, robot)
     one = kinds[0].kind if len(kinds) == 1 and "kinds" not in table.settings.content else None
     if one is None or one.poses_per_row != 1 or one.label_count:
-        raise FileError(report_finding("sheet.kinds", count=len(kinds)), path)
+        raise FileError.of("sheet.kinds", path, count=len(kinds))
     names = [column.name for column in kinds[0].kind.columns]
     for row, cells in enumerate(zip(*(table.text(name) for name in names), strict=True)):
         if any(cells):
@@ -687,7 +689,7 @@ def _name_rows(
     if len(rows) != len(poses) * k:
         counts: dict[str, Any] = {"wanted": len(poses) * k, "poses": len(poses)}
         counts |= {"targets": k, "count": len(rows)}
-        raise FileError(report_finding("sheet.count-differs", **counts), export)
+        raise FileError.of("sheet.count-differs", export, **counts)
     return [
         (poses[i // k], {n: c for n, c in row.items() if n != "pose"}) for i, row in enumerate(rows)
     ]

@@ -486,9 +486,7 @@ def find_profile_file(source: str | Path) -> Path:
     if path.exists():
         return path
     similar = suggest_names(str(source), shipped)
-    raise FileError(
-        report_finding("files.profile-missing", similar=similar, shipped=tuple(shipped)), path
-    )
+    raise FileError.of("files.profile-missing", path, similar=similar, shipped=tuple(shipped))
 
 
 def with_local_settings(

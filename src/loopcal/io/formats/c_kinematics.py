@@ -376,7 +376,7 @@ def _add_limbs(tables: _Tables, robot: Mechanism, e: FloatArray, drives: int) ->
         placed, count = place_links(group, e), len(group.joints)
         passive, driven = group.unknown_joints(free=False), group.driven_joints
         if program.sigma is not None and (passive or len(group.rows) > 1 or len(driven) != 1):
-            raise DataError(report_finding("files.c-redundant", robot=robot.name))
+            raise DataError.of("files.c-redundant", robot=robot.name)
         # a ball has positions only
         row = [r + (3 if group.ending == "ball" else 0) for r in group.rows]
         for k in range(len(group.limbs)):

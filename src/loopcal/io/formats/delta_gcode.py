@@ -359,8 +359,7 @@ class DeltaFirmware:
         if foreign := self.find_foreign(file):
             (what, line), (program, name, _) = foreign, self.others
             code = "files.other-firmware"
-            finding = report_finding(code, what=what, program=program, format=name)
-            raise FileError(finding, path, line + 1)
+            raise FileError.of(code, path, line + 1, what=what, program=program, format=name)
         self.refuse(file)
         return file
 

@@ -21,7 +21,6 @@ from typing import Literal
 import numpy as np
 
 from loopcal.errors import DataError
-from loopcal.findings import report_finding
 from loopcal.io.core.csv_table import read_table, require_columns
 from loopcal.io.data.columns import FIT, HELD_OUT, USE_COLUMN
 from loopcal.io.formats.program_format import DECIMALS, format_short
@@ -133,7 +132,7 @@ def _require_words(robot: Mechanism) -> None:
     """Raise DataError where a controlled coordinate has no word."""
     if others := tuple(name for name in robot.controlled if name not in WORDS):
         code = "files.no-gcode-word"
-        raise DataError(report_finding(code, robot=robot.name, names=others, words=tuple(WORDS)))
+        raise DataError.of(code, robot=robot.name, names=others, words=tuple(WORDS))
 
 
 def _clean(text: str) -> str:

@@ -225,8 +225,7 @@ def parse(path: Path) -> Samples:
     stated = content.get(TAPED)  # null or 0 for lines that were not taped
     cells = [None] * lines if stated is None else stated if isinstance(stated, list) else []
     if len(cells) != lines or not all(v is None or (_is_number(v) and v >= 0.0) for v in cells):
-        finding = report_finding("files.taped-lengths", key=TAPED, value=str(stated), lines=lines)
-        raise FileError(finding, path)
+        raise FileError.of("files.taped-lengths", path, key=TAPED, value=str(stated), lines=lines)
     taped = np.array([v or np.nan for v in cells], dtype=float)
     gear = float(motor_teeth / spool_teeth)
     spools, findings = (radius, advantage, per_spool, gear), tuple(_report_ignored(content))
@@ -257,13 +256,13 @@ def estimate_anchors(samples: Samples, path: Path) -> FloatArray:
         if samples.is_taped[i]:
             length = float(np.linalg.norm(anchor))
             if not 1.0 / FAR_OFF < samples.taped[i] / length < FAR_OFF:
-                finding = report_finding(
+                raise FileError.of(
                     "files.taped-length-far-off",
+                    path,
                     line=name,
                     taped=Quantity(float(samples.taped[i]), "mm"),
                     estimate=Quantity(length, "mm"),
                 )
-                raise FileError(finding, path)
             anchor *= samples.taped[i] / length
         anchors.append(anchor)
     return np.array(anchors)
@@ -388,8 +387,7 @@ def _parse_numbers(
         for number, length in enumerate(lengths, 1):
             if length != usual:
                 code = "files.row-incomplete"
-                finding = report_finding(code, key=key, row=number, length=length, usual=usual)
-                raise FileError(finding, path)
+                raise FileError.of(code, path, key=key, row=number, length=length, usual=usual)
     cells = np.array(rows, dtype=object)
     has_shape = cells.ndim == ndim and cells.size and width in (None, *cells.shape[-1:])
     if not has_shape or not all(map(_is_number, cells.flat)):

@@ -46,9 +46,9 @@ def choose_format(path: Path, name: str | None, *, is_written: bool = False) -> 
         if path.suffix.lower() in entry.endings:
             return entry
     if not is_written and path.is_file() and ANSWER.search(read_text(path, "G-code file")):
-        raise FileError(report_finding("files.report-first"), path)
+        raise FileError.of("files.report-first", path)
     names = list_formats("write" if is_written else "read")
-    raise FileError(report_finding("files.format-unknown", formats=names), path)
+    raise FileError.of("files.format-unknown", path, formats=names)
 
 
 def recognize_format(path: Path, text: str) -> str | None:
@@ -84,8 +84,7 @@ def save_imported(path: Path, imported: Imported, output: Path, data: Path | Non
             reason = " ".join(
                 str(f) for f in imported.findings if f.severity is Severity.SUGGESTION
             )
-            finding = report_finding("files.no-measurements", file=str(path), reason=reason)
-            raise DataError(finding)
+            raise DataError.of("files.no-measurements", file=str(path), reason=reason)
         save_measurements(imported.measurements, data, robot, f"read from {path.name}")
     write_text(output, imported.robot_text)
     return load_robot(output)
@@ -117,7 +116,7 @@ def export_robot(source: ExportSource, target: Format, into: Path | None) -> Exp
     if target.table is not None and not source.tables:
         raise DataError(f"the format {target.name} is a table of corrections. Give its tables")
     if into is not None and not target.takes_file:
-        raise DataError(report_finding("files.format-takes-no-file", format=target.name))
+        raise DataError.of("files.format-takes-no-file", format=target.name)
     exported = target.write(source, into)
     return replace(exported, findings=(*exported.findings, *source.findings))
 

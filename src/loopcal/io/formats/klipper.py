@@ -311,7 +311,7 @@ def _list_rotary(source: ExportSource) -> dict[Name, float | str]:
         offset, angle, upper, lower = (values[name] for name in names)
         x = values["shoulder_radius"] + upper * math.cos(offset)
         if lower < abs(x):
-            raise DataError(report_finding("files.arms-out-of-reach", section=section))
+            raise DataError.of("files.arms-out-of-reach", section=section)
         z = values["shoulder_height"] - upper * math.sin(offset) - math.sqrt(lower**2 - x**2)
         wanted[section, "angle"] = show(angle, names[1], math.radians(1))
         wanted[section, "upper_arm_length"] = show(upper, names[2])

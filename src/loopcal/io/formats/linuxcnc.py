@@ -100,7 +100,7 @@ def read(path: Path, options: ImportOptions) -> Imported:
     """
     hal = _read_hal(path)
     if options.length_unit is None:
-        raise FileError(report_finding("files.unit-missing"), path)
+        raise FileError.of("files.unit-missing", path)
     unit = find_unit(options.length_unit, Dimension.LENGTH)
     lift, lead = hal.lift, hal.pin(LEAD, 0.0)
     base, platform = (hal.points(side) + lift * UP for side in SIDES)
@@ -274,7 +274,7 @@ def write_ini(source: ExportSource, into: Path | None) -> Exported:
             lines += [f"[{joint}]", f"# add {shown} {unit} to {OFFSET}"]
         return Exported("\n".join(lines) + "\n")
     if not all(nominal[name] for name in lengths.values()):
-        raise DataError(report_finding("files.ini-needed", robot=source.robot.name))
+        raise DataError.of("files.ini-needed", robot=source.robot.name)
     wanted = {(joint, OFFSET): scale(name, 0.0, 0.0) for joint, name in lengths.items()}
     notes = (*findings, report_finding("files.offset-at-reading-zero"))
     return IniFile.parse((), Path("machine.ini")).export(None, wanted, {}, notes)

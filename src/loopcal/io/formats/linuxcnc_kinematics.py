@@ -18,7 +18,6 @@ from pathlib import Path
 import numpy as np
 
 from loopcal.errors import DataError
-from loopcal.findings import report_finding
 from loopcal.io.formats.c_kinematics import fill_template, list_movable, note_lost_terms
 from loopcal.io.formats.program_format import Exported, ExportSource, Format
 from loopcal.mechanism.kinematics import compute_readings
@@ -40,8 +39,7 @@ def write(source: ExportSource, into: Path | None) -> Exported:
     robot = source.robot
     others = [name for name in robot.controlled if name not in AXES]
     if others:
-        found = report_finding("files.no-axis", robot=robot.name, names=tuple(others))
-        raise DataError(found)
+        raise DataError.of("files.no-axis", robot=robot.name, names=tuple(others))
     places, unit = list_movable(robot), robot.get_unit(Dimension.LENGTH)
     units = {Dimension.LENGTH: unit, Dimension.ANGLE: UNITS["deg"]}
     commanded = [actuator for actuator in robot.actuators if actuator.reference is None]

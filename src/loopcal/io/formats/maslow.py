@@ -117,11 +117,11 @@ def _read_log(path: Path) -> list[list[float]]:
         if (match := BLOCK.search(line))
     ]
     if not blocks:
-        raise FileError(report_finding("files.no-waypoints"), path)
+        raise FileError.of("files.no-waypoints", path)
     line, block = blocks[-1]
     rows = WAYPOINT.findall(block)
     if not rows or len(rows) != block.count("{"):
-        raise FileError(report_finding("files.waypoint-incomplete"), path, line)
+        raise FileError.of("files.waypoint-incomplete", path, line)
     return [[parse_number(cell, "a length of CLBM", path, line) for cell in row] for row in rows]
 
 

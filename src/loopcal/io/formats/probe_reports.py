@@ -93,8 +93,7 @@ def import_probes(
     probe = _read_probe((path, *options.probes), firmware)
     points, noted = read_reports(options.probes, firmware, probe)
     if len(points) < FEWEST:
-        finding = report_finding("files.probes-too-few", count=len(points), least=FEWEST)
-        raise FileError(finding, first)
+        raise FileError.of("files.probes-too-few", first, count=len(points), least=FEWEST)
     heights = np.array([p.height for p in points])
     stored = max(DATE.findall(read_text(path, "G-code file").replace("T", " ")), default="")
     reports = (read_text(file, "probe report") for file in options.probes)
@@ -111,7 +110,7 @@ def import_probes(
     solution = inverse(robot, MM * np.array([(p.x, p.y, p.height) for p in points]))
     if not solution.converged.all():
         label = labels[int(np.argmin(solution.converged))]
-        raise FileError(report_finding("files.probe-out-of-reach", point=label), first)
+        raise FileError.of("files.probe-out-of-reach", first, point=label)
     kind, zeros = Component(components=("z",)), np.zeros((len(points), 1))
     rows = options.observe(kind, range(len(points)), zeros, "height")
     finding = report_finding(
@@ -147,7 +146,7 @@ def read_reports(
     dates = [_list_times([text]) or [""] for text in texts.values() if ANSWER.search(text)]
     noted += report_days([time[:10] for of_file in dates for time in of_file])
     if not points:
-        raise FileError(report_finding("files.no-probe-report", firmware=firmware), paths[0])
+        raise FileError.of("files.no-probe-report", paths[0], firmware=firmware)
     return points, noted
 
 
@@ -181,7 +180,7 @@ def check_heights(
         least, largest = (Quantity(float(h), "mm") for h in (heights.min(), heights.max()))
         facts = {"least": least, "largest": largest, "firmware": firmware}
         if deviation > ROUGH and firmware != "klipper":
-            raise FileError(report_finding("files.heights-unit", **facts), path)
+            raise FileError.of("files.heights-unit", path, **facts)
         noted.append(report_finding("files.heights-unit", Severity.WARNING, **facts))
     rest = float(np.sqrt(((heights - heights.mean()) ** 2).mean()))
     if abs(shift) < max(SHIFTED, 3.0 * rest):
@@ -235,7 +234,7 @@ def _read_marlin(
                 dry = DRY_RUN.search(line)
                 if dry is None or dry[1] is None:
                     reason = "calibrates" if dry is None else "radius"
-                    raise FileError(report_finding("files.g33-unusable", reason=reason), path, i)
+                    raise FileError.of("files.g33-unusable", path, i, reason=reason)
                 radius = parse_number(dry[1], "the radius", path, i)
             elif TOUCH.search(line):
                 raise _report_unreadable(line, "marlin", path, i)
@@ -338,7 +337,7 @@ def _read_stops(texts: Mapping[Path, str], probe: Mapping[str, float]) -> list[P
         return []
     finding = None
     if unanswered and len(places) - len(stops) == len(unanswered):
-        raise FileError(report_finding("files.probe-unanswered"), *unanswered[0])
+        raise FileError.of("files.probe-unanswered", *unanswered[0])
     if len(places) != len(stops):
         finding = report_finding("files.g32-too-few", count=len(stops), points=len(places))
     elif any(len(place) < 2 for place in places):
@@ -372,10 +371,10 @@ def _read_height_map(path: Path, text: str) -> list[ProbedPoint]:
             names = ("xmin", "ymin", "xspacing", "yspacing", "xnum", "ynum")
         numbers = [parse_number(stated[name], name, path, line) for name in names]
     except (KeyError, ValueError):
-        raise FileError(report_finding("files.height-map-damaged"), path) from None
+        raise FileError.of("files.height-map-damaged", path) from None
     x0, y0, dx, dy, width, count = numbers
     if len(rows) != count or any(len(row) != width for _, row in rows):
-        raise FileError(report_finding("files.height-map-damaged"), path)
+        raise FileError.of("files.height-map-damaged", path)
     return [
         ProbedPoint(x0 + k * dx, y0 + j * dy, parse_number(cell, "a height", path, line))
         for j, (line, row) in enumerate(rows)

@@ -28,7 +28,6 @@ from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_ori
 import numpy as np
 
 from loopcal.errors import DataError, FileError, MechanismError, UnitError, suggest_names
-from loopcal.findings import report_finding
 from loopcal.io.core.csv_table import format_scaled
 from loopcal.io.core.records import Units, get_field_types, read_record, read_units
 from loopcal.io.core.text_file import as_path, name_files, write_text
@@ -273,7 +272,7 @@ def find_robot_file(source: str | Path) -> Path:
     if path.exists():
         program = PROGRAMS.get(path.suffix.lower())
         if program is not None and path.is_file():
-            raise FileError(report_finding("files.robot-of-program", program=program), path)
+            raise FileError.of("files.robot-of-program", path, program=program)
         return path
     hint, names = suggest_names(str(source), shipped), ", ".join(shipped) or "none"
     act = f"name a file, or one of the shipped robots: {names}"

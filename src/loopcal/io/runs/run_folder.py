@@ -206,7 +206,7 @@ def read_result(path: Path) -> dict[str, Any]:
 
 def report_damage(path: Path, problem: str) -> FileError:
     """Return the error of a file of a run that is damaged; `problem` says how."""
-    return FileError(report_finding("files.run-damaged", problem=problem), path)
+    return FileError.of("files.run-damaged", path, problem=problem)
 
 
 # The arrays of a run folder: an archive of NumPy's, read without trust in what it says of itself.
@@ -497,7 +497,7 @@ class Run(Result):
         if self.failure is not None:
             raise DataError(self.failure)
         if self.result.get("states_expected_error") is False:
-            raise DataError(report_finding("accuracy.volume-open", reason="noise"))
+            raise DataError.of("accuracy.volume-open", reason="noise")
         return self.load_posterior()
 
     def load_uncertainty(self) -> FitUncertainty | None:
@@ -523,7 +523,7 @@ class Run(Result):
         """
         budget = self.result.get("expected_error")
         if budget is None:
-            raise DataError(report_finding("files.no-budget", run=str(self.path)))
+            raise DataError.of("files.no-budget", run=str(self.path))
         return dict(budget)
 
     def load_measurements(self, **allowed: bool) -> tuple[Measurements, Measurements | None]:
@@ -588,7 +588,7 @@ def repeat_fit(
     estimate, sd = run.arrays["estimate"], fit.standard_deviations
     allowed = EQUAL * np.where(np.isfinite(sd), sd, np.inf)
     if len(estimate) != len(sd) or (np.abs(fit.estimate - estimate) > allowed).any():
-        raise EstimationError(report_finding("sampling.run-not-repeated", run=str(run.path)))
+        raise EstimationError.of("sampling.run-not-repeated", run=str(run.path))
     return fit, data
 
 
@@ -738,8 +738,9 @@ def load_run(path: str | Path) -> Run:
     free = [name for name, is_free in zip(table.names, table.free, strict=True) if is_free]
     if [name for name in free if name in stated] != stated or len(before) != len(table):
         name = (sorted({*stated} - {*free}) or free)[0]
-        finding = report_finding("files.run-robot-changed", result=RESULT, name=name)
-        raise FileError(finding, _find_robot_file(path))
+        raise FileError.of(
+            "files.run-robot-changed", _find_robot_file(path), result=RESULT, name=name
+        )
     initial = robot.with_values(before)
     names = [row["name"] for row in result["fit"]["local"]]
     values, initial_values = (
@@ -753,7 +754,7 @@ def refuse_changed_run(run: Run) -> None:
     """Raise FileError where a file of a run folder is not the one that the calibration wrote."""
     changed = list_changed_files(run.path, RUN)
     if changed:
-        raise FileError(report_finding("files.run-changed", files=changed), run.path)
+        raise FileError.of("files.run-changed", run.path, files=changed)
 
 
 def load_run_or_robot(path: str | Path) -> Run:

@@ -128,13 +128,13 @@ def open_session(folder: Path, sheet: Table, columns: Sequence[str]) -> Iterator
     """
     path, digest = resolve_links(folder) / ROWS, sha256(sheet.path)
     if folder.exists() and not path.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise FileError(report_finding("session.other-content"), folder)
+        raise FileError.of("session.other-content", folder)
     with report_write_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o666)
     try:
         if lock(descriptor) is False:
-            raise FileError(report_finding("session.in-use"), folder)
+            raise FileError.of("session.in-use", folder)
         header = {"event": None, "row": None, "pose": None, TIME: None}
         header |= {name: sheet.units[name] for name in columns}
         lines = [REMARK, "# format: 1", f"# sheet: {digest}", format_row(format_header(header))]
@@ -144,9 +144,9 @@ def open_session(folder: Path, sheet: Table, columns: Sequence[str]) -> Iterator
             write_line(descriptor, path, "\n".join(lines))
             sync_folder(path.parent)
         elif not content.startswith(REMARK.encode()):
-            raise FileError(report_finding("session.other-content"), folder)
+            raise FileError.of("session.other-content", folder)
         elif not content.startswith(begin):
-            raise FileError(report_finding("session.other-sheet", sheet=str(sheet.path)), path)
+            raise FileError.of("session.other-sheet", path, sheet=str(sheet.path))
         elif not content.endswith(b"\n"):  # a row that was not written to its end
             os.ftruncate(descriptor, content.rfind(b"\n") + 1)
         journal = Journal(path, sheet, tuple(columns), descriptor)

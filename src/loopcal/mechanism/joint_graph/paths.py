@@ -16,7 +16,6 @@ import numpy as np
 
 from loopcal import geometry
 from loopcal.errors import MechanismError
-from loopcal.findings import report_finding
 from loopcal.mechanism.assembly import AXES
 from loopcal.mechanism.joint_graph.graph import Coupling, GraphJoint, turn_between
 from loopcal.mechanism.joint_graph.loops import (
@@ -337,8 +336,7 @@ def find_stage_paths(
     for block in blocks:
         if not block.graph.motors:
             names = tuple(joint.name for joint in block.graph.joints)
-            finding = report_finding("files.joints-not-held", joints=names, platform=platform)
-            raise MechanismError(finding)
+            raise MechanismError.of("files.joints-not-held", joints=names, platform=platform)
     if all(block.is_serial for block in blocks):
         blocks = (Block(graph, platform),)
     homes, is_drawn = find_homes(graph)
@@ -360,7 +358,7 @@ def find_stage_paths(
             limbs = find_limbs(block.graph, block.platform)
             limbs = _keep_shifts_in_plane(block.graph, values, limbs, freedoms)
             if find_freedoms(*own).mobility == 0:
-                raise MechanismError(report_finding("files.no-motion", platform=block.platform))
+                raise MechanismError.of("files.no-motion", platform=block.platform)
             stages.append(ClosedStage(*own, limbs, freedoms, mount, _align_frame(*own, frame)))
     names = {joint.name for joint in kept.joints}
     dangling = tuple(joint.name for joint in whole.joints if joint.name not in names)
@@ -503,9 +501,7 @@ def weld_bodies(base: str, welds: Sequence[Weld]) -> Bodies:
     for weld in welds:
         (a, A), (b, B) = bodies.locate(weld.body_a), bodies.locate(weld.body_b)
         if a == b:
-            raise MechanismError(
-                report_finding("files.closure-within-body", closure=weld.name, body=a)
-            )
+            raise MechanismError.of("files.closure-within-body", closure=weld.name, body=a)
         T_ab = A @ weld.T_a @ geometry.invert_pose(B @ weld.T_b)
         if b == base:
             a, b, T_ab = b, a, geometry.invert_pose(T_ab)
@@ -520,8 +516,8 @@ def assemble_graph(base: str, joints: Sequence[GraphJoint], motors: tuple[str, .
     """
     for joint in joints:
         if joint.body_a == joint.body_b:
-            raise MechanismError(
-                report_finding("files.closure-within-body", closure=joint.name, body=joint.body_a)
+            raise MechanismError.of(
+                "files.closure-within-body", closure=joint.name, body=joint.body_a
             )
     _refuse_repeated(joints)
     joints = [replace(j, drive=j.name) if j.name in motors else j for j in joints]
@@ -589,14 +585,13 @@ def _refuse_repeated(joints: Sequence[GraphJoint]) -> None:
             same = other.orient(joint.body_a)
             gaps = (joint.T_a[:3, 3] - same.T_a[:3, 3], joint.T_b[:3, 3] - same.T_b[:3, 3])
             if np.abs(gaps).max() < COAXIAL:
-                finding = report_finding(
+                raise MechanismError.of(
                     "files.closure-repeated",
                     closure=joint.name,
                     other=other.name,
                     body_a=joint.body_a,
                     body_b=joint.body_b,
                 )
-                raise MechanismError(finding)
 
 
 def _merge_pins(base: str, joints: list[GraphJoint]) -> tuple[GraphJoint, ...]:
@@ -656,5 +651,5 @@ def _span_tree(
         chosen = [joint for joint in chosen if joint not in ready]
     lost = next((joint.name for joint in closing if joint.drive), None)
     if lost is not None:
-        raise MechanismError(report_finding("files.motors-in-loop", motor=lost))
+        raise MechanismError.of("files.motors-in-loop", motor=lost)
     return tuple(tree), tuple(joint for joint in joints if joint in closing)

@@ -168,7 +168,7 @@ class StudyStore:
             "".join((rows["specification"], *columns)).encode()  # all are text
             return StoreHeader(rows["specification"], tuple(columns), versions)
         except (KeyError, TypeError, ValueError, RecursionError):
-            raise FileError(report_finding("store.damaged"), self.path) from None
+            raise FileError.of("store.damaged", self.path) from None
 
     @cached_property
     def study(self) -> Study:
@@ -267,8 +267,9 @@ class StudyStore:
         question = f"SELECT key, block, trials, seconds, scores, digest {OF_CELL} ORDER BY block"
         for row in self.ask(question, name):
             if _compute_digest(name, *row[:-1]) != row[-1]:
-                finding = report_finding("store.block-damaged", block=_name_block(name, row[1]))
-                raise FileError(finding, self.path)
+                raise FileError.of(
+                    "store.block-damaged", self.path, block=_name_block(name, row[1])
+                )
             yield row
 
     def find_misshapen(self) -> dict[int, str]:
@@ -283,7 +284,7 @@ class StudyStore:
         question = f"SELECT levels, block {WITH_CELLS} WHERE blocks.rowid = ?"
         found = {row: next(self.ask(question, row), None) for row in rows}
         if None in found.values():  # an index lists rows that the table does not have
-            raise FileError(report_finding("store.damaged"), self.path)
+            raise FileError.of("store.damaged", self.path)
         return {row: _name_block(*names) for row, names in found.items() if names}
 
     def remove_damaged(self) -> tuple[str, ...]:
@@ -299,9 +300,9 @@ class StudyStore:
     def check(self) -> None:
         """Read the whole store, and raise FileError where it is damaged."""
         if next(self.ask("PRAGMA quick_check(1)")) != ("ok",):
-            raise FileError(report_finding("store.damaged"), self.path)
+            raise FileError.of("store.damaged", self.path)
         for _, block in self._find_changed():
-            raise FileError(report_finding("store.block-damaged", block=block), self.path)
+            raise FileError.of("store.block-damaged", self.path, block=block)
 
     def _find_changed(self) -> Iterator[tuple[int, str]]:
         """Yield the rows and names of the well-shaped blocks whose digest is another."""
@@ -362,7 +363,7 @@ def open_store(folder: Path) -> Iterator[StudyStore]:
     descriptor = open_folder(folder)
     try:
         if descriptor is not None and lock(descriptor) is False:
-            raise FileError(report_finding("store.other-driver"), folder)
+            raise FileError.of("store.other-driver", folder)
         with _report_errors(path), closing(sqlite3.connect(path, timeout=PATIENCE)) as connection:
             _refuse_others(path, connection)
             connection.execute("PRAGMA journal_mode = WAL")
@@ -395,7 +396,7 @@ def read_store(folder: Path) -> Iterator[StudyStore]:
         _refuse_others(path, connection)
         store = StudyStore(path, connection)
         for block in store.find_misshapen().values():
-            raise FileError(report_finding("store.block-damaged", block=block), path)
+            raise FileError.of("store.block-damaged", path, block=block)
         yield store
 
 
@@ -432,14 +433,14 @@ def refuse_network(folder: Path) -> None:
     """Raise FileError where a folder is on a network file system."""
     kind = find_network_file_system(folder)
     if kind is not None:
-        raise FileError(report_finding("store.network-file-system", kind=kind), folder)
+        raise FileError.of("store.network-file-system", folder, kind=kind)
 
 
 def _find_store(folder: Path) -> Path:
     """Return the path of a store, or refuse a folder without one."""
     path = folder / NAME
     if not path.is_file():
-        raise FileError(report_finding("store.missing", file=NAME), folder)
+        raise FileError.of("store.missing", folder, file=NAME)
     return path
 
 
@@ -451,15 +452,14 @@ def _refuse_others(path: Path, connection: sqlite3.Connection) -> None:
     (application,) = connection.execute("PRAGMA application_id").fetchone()
     (version,) = connection.execute("PRAGMA user_version").fetchone()
     if application != APPLICATION:
-        raise FileError(report_finding("store.damaged"), path)
+        raise FileError.of("store.damaged", path)
     if version != FORMAT:
-        finding = report_finding("store.other-format", found=version, known=FORMAT)
-        raise FileError(finding, path)
+        raise FileError.of("store.other-format", path, found=version, known=FORMAT)
     question = "SELECT type, name, tbl_name, sql FROM sqlite_schema"
     with closing(sqlite3.connect(":memory:")) as ours:
         ours.executescript(TABLES)
         if set(connection.execute(question)) != set(ours.execute(question)):
-            raise FileError(report_finding("store.damaged"), path)
+            raise FileError.of("store.damaged", path)
 
 
 # Errors of a full disk; SQLite calls a file that must not grow an error of input and output.
@@ -476,7 +476,7 @@ def _report_errors(path: Path, full: str = "store.disk-full") -> Iterator[None]:
     try:
         yield
     except UnicodeDecodeError as error:
-        raise FileError(report_finding("store.damaged"), path) from error
+        raise FileError.of("store.damaged", path) from error
     except sqlite3.Error as error:
         number = getattr(error, "sqlite_errorcode", 0) & 0xFF
         reason = str(error)
@@ -522,13 +522,12 @@ def open_study(folder: Path, source: StudySource, resume: bool = False) -> Itera
     if is_new:
         _make_folder(folder, source)
     elif not resume:
-        raise FileError(report_finding("store.in-use"), folder)
+        raise FileError.of("store.in-use", folder)
     try:
         with open_store(folder) as store:
             header, study = store.header, source.study
             if changes := list_conflicts(load_specification(store).to_json(), study.to_json()):
-                finding = report_finding("store.specification-changed", changes=changes)
-                raise FileError(finding, folder)
+                raise FileError.of("store.specification-changed", folder, changes=changes)
             if header.specification != study.to_json():
                 store.set_header(replace(header, specification=study.to_json()))
             try:
@@ -561,8 +560,7 @@ def load_specification(store: StudyStore) -> Study:
     except (ValueError, RecursionError):  # it has settings that this version does not know
         part, known = PROGRAM, __version__
     found = header.versions.get(part, "")
-    finding = report_finding("store.other-numbers", part=part, found=found, known=known)
-    raise FileError(finding, store.path)
+    raise FileError.of("store.other-numbers", store.path, part=part, found=found, known=known)
 
 
 def _make_folder(folder: Path, source: StudySource) -> None:
@@ -592,7 +590,7 @@ def _refuse_content(folder: Path) -> None:
         raise FileError(sentence, folder)
     if target.is_dir() and any(target.iterdir()):
         code = "store.in-use" if (target / NAME).is_file() else "store.folder-of-others"
-        raise FileError(report_finding(code), folder)
+        raise FileError.of(code, folder)
 
 
 def _list_files(source: StudySource) -> Iterator[tuple[str, Path]]:
@@ -624,9 +622,7 @@ def merge_studies(
     for part, study in zip(part_folders, studies, strict=True):
         if changes := list_conflicts(study.to_json(), largest.to_json()):
             code = "store.part-of-other-study"
-            raise FileError(
-                report_finding(code, other=str(part_folders[first]), changes=changes), part
-            )
+            raise FileError.of(code, part, other=str(part_folders[first]), changes=changes)
     for part in (*part_folders, *([folder] if (folder / NAME).is_file() else [])):
         with read_store(part) as other:
             other.check()  # before anything is written

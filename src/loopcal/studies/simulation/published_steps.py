@@ -48,7 +48,6 @@ from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.linearization import Linearization, Start
 from loopcal.estimate.penalties import LeastSquares, Method
 from loopcal.estimate.problem import Problem, problem_of_trials
-from loopcal.findings import report_finding
 from loopcal.findings.wording import name_count
 from loopcal.measure.instrument import Gaussian
 from loopcal.measure.measurements import Measurements
@@ -469,7 +468,7 @@ def check_legs(robot: Mechanism) -> None:
 def _check_actuators(robot: Mechanism) -> None:
     if len(robot.actuators) != 6:
         facts = {"robot": robot.name, "actuators": len(robot.actuators)}
-        raise EstimationError(report_finding("fit.no-six-legs", **facts))
+        raise EstimationError.of("fit.no-six-legs", **facts)
 
 
 def _refuse_coupled(robot: Mechanism, count: IntArray, is_wrong: BoolArray) -> None:
@@ -477,7 +476,7 @@ def _refuse_coupled(robot: Mechanism, count: IntArray, is_wrong: BoolArray) -> N
     places = np.flatnonzero(robot.parameters.free & is_wrong)
     if places.size:
         facts = {"parameter": robot.parameters.names[places[0]], "legs": int(count[places[0]])}
-        raise EstimationError(report_finding("fit.legs-coupled", robot=robot.name, **facts))
+        raise EstimationError.of("fit.legs-coupled", robot=robot.name, **facts)
 
 
 def _check_members(robot: Mechanism, legs: LegForm, poses: int) -> None:

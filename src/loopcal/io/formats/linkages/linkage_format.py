@@ -80,7 +80,7 @@ def write(
     families = Limbs, PlacedStages
     record = get_record(source, families, what.lower(), "a robot of the family limbs or stages")
     if into is None:
-        raise DataError(report_finding("files.urdf-needed"))
+        raise DataError.of("files.urdf-needed")
     tree, changes, expressed = read_tree(into), [], set()
     nominal = source.robot.parameters.nominal.tolist()
     values = zip(source.values().items(), nominal, strict=True)
@@ -240,7 +240,7 @@ def read(tree: LinkTree, options: ImportOptions, what: str) -> Imported:
     """Return the robot of a file and its closures; FileError where its loops do not close."""
     path, closures = tree.path, options.closures or find_closures(tree.path)
     if closures is None and not tree.constraints and not tree.motors:
-        raise FileError(report_finding("files.closures-missing", what=what), path)
+        raise FileError.of("files.closures-missing", path, what=what)
     mechanism = read_mechanism(tree, closures)
     platform, frame = _find_platform(mechanism, options.platform)
 
@@ -252,10 +252,7 @@ def read(tree: LinkTree, options: ImportOptions, what: str) -> Imported:
             mechanism.graph, platform, locate_frame, mechanism.measure_rounding
         )
         if paths.outside and options.platform is None:
-            finding = report_finding(
-                "files.motors-outside", motors=paths.outside, platform=platform
-            )
-            raise MechanismError(finding)
+            raise MechanismError.of("files.motors-outside", motors=paths.outside, platform=platform)
     except MechanismError as error:
         # the refusal names links of the file instead of the bodies that they form
         bodies = {"body", "body_a", "body_b", "platform"}
@@ -318,16 +315,14 @@ def _find_platform(mechanism: Linkage, name: str | None) -> tuple[str, str]:
         known = name in {*tree.carrier, tree.root}
         body = mechanism.locate(name)[0] if known else None
         if body not in moving:
-            finding = report_finding("files.platform-unknown", platform=name, links=links)
-            raise FileError(finding, tree.path)
+            raise FileError.of("files.platform-unknown", tree.path, platform=name, links=links)
         return str(body), name
     chosen = frames if len(frames) == 1 else suited
     if len(chosen) == 1:
         return mechanism.locate(chosen[0])[0], chosen[0]
     if not chosen and len(possible) == 1:
         return possible[0], choose_link(mechanism, possible[0])
-    finding = report_finding("files.platform-unclear", frames=tuple(frames), links=links)
-    raise FileError(finding, tree.path)
+    raise FileError.of("files.platform-unclear", tree.path, frames=tuple(frames), links=links)
 
 
 def _check_couplings(mechanism: Linkage, names: Collection[str]) -> None:
