@@ -29,7 +29,7 @@ extensions = [
 ]
 root_doc = "docs/README"
 include_patterns = ["docs/**", "README.md", "ARCHITECTURE.md", "CHANGELOG.md", "CONTRIBUTING.md",
-                    "SECURITY.md", "evidence/README.md", "native/README.md",
+                    "SECURITY.md", "benchmarks/README.md", "evidence/README.md", "native/README.md",
                     "examples/*/README.md"]  # fmt: skip
 exclude_patterns = [".*", "build", "dist", "runs", "src", "tests", "tools", "benchmarks",
                     "constraints", "docs/gallery", "docs/evidence"]  # fmt: skip

@@ -116,9 +116,10 @@ def refer_to_others(keys: Keys, shown: dict[str, Keys]) -> tuple[str, Keys]:
 def format_keys(keys: Keys) -> str:
     """Return a table of keys, or a list if none has a meaning."""
     rows = merge_rows((f"`{k.name}`", k.holds, k.meaning) for k in keys)
+    named = [(f"{names}: {holds}", meaning) for names, holds, meaning in rows]
     if any(key.meaning for key in keys):
-        return format_table(("key", "holds (default)", "meaning"), rows)
-    return "".join(f"- {name}: {holds}\n" for name, holds, _ in rows)
+        return format_table(("key: what it holds (default)", "meaning"), named)
+    return "".join(f"- {key}\n" for key, _ in named)
 
 
 def merge_rows(rows: Iterable[tuple[str, ...]]) -> list[tuple[str, ...]]:

@@ -22,7 +22,7 @@ WORDING = ROOT / "tests" / "findings" / "wording.txt"
 SENTENCE_END = re.compile(r"(?<=[.?]) (?=[A-Z`'{]|loopcal)")
 PLACEHOLDER = re.compile(r"\{(?P<name>\w+)[^{}]*\}")
 WORD = re.compile(r"(?:\*[^*]*\*|`[^`]*`|[^\s*`])+")
-SHOWN_WORDS = 8  # of the first sentence of a message
+SHOWN_WORDS = 6  # of the first sentence of a message
 SEVERITIES = {
     Severity.INFO: "worth knowing. The result is usable as it is",
     Severity.SUGGESTION: "a step that would improve the result",
@@ -35,15 +35,14 @@ HEAD = """# Findings
 
 <!-- made by tools.findings_reference; `make docs` writes it anew -->
 
-Notes, warnings and refusals are findings: a code, a severity, data and a text. Programs read code
-and data. The text is for people and may change. In Python, results hold `findings`, `str(finding)`
-is the text, and an error has the `code` of its finding. In JSON, the keys are `code`, `severity`,
-`data` and `text`.
+Notes, warnings and refusals are findings. In JSON a finding has `code`, `severity`, `data` and
+`text`. Programs read code and data, because the text may change. In Python, results hold
+`findings`, `str(finding)` is the text, and an error has the `code` of its finding.
 
 Most messages say what happened and what to do, so this page only lists their codes by severity
 ([all texts](../tests/findings/wording.txt)). The tables have the others: how the message begins,
-then what it leaves out, its condition and what to do. Words in *italics* stand for data, and texts
-in quotation marks are examples.
+then its condition and what to do. Words in *italics* stand for data, and texts in quotation marks
+are examples.
 """
 
 
@@ -78,12 +77,12 @@ def write_page() -> str:
     for file in catalog.FILES:
         entries = [(e, describe_circumstances(e)) for e in catalog.read_entries(file).values()]
         rows = [
-            (f"`{e.code}`", e.severity.value, f"{describe_text(e)}<br>{circumstances}")
+            (f"`{e.code}` ({e.severity.value})", f"{describe_text(e)}<br>{circumstances}")
             for e, circumstances in entries
             if circumstances
         ]
         sections.append(f"## {catalog.read_document(file)['title']}\n")
-        sections += [format_table(("code", "severity", "text"), rows)] * bool(rows)
+        sections += [format_table(("code (severity)", "text"), rows)] * bool(rows)
         sections.append(list_codes([e for e, circumstances in entries if not circumstances]))
     return "\n".join(sections)
 
