@@ -240,6 +240,7 @@ def build_scene(machine: Machine, rng: np.random.Generator, poses: int) -> Scene
         for t, T in zip(twist, (camera, board), strict=True)
     )
     lens = TRUE_LENS * (1.0 + 0.01 * rng.standard_normal(9))
+    lens[1] = lens[0] * TRUE_LENS[1] / TRUE_LENS[0]  # pixels of phones are nearly square
     return Scene(truth, q, x, (camera, board), (true_camera, true_board), lens)
 
 
@@ -286,8 +287,9 @@ def simulate_machine(machine: Machine, seed: int, poses: int = POSES) -> Sample:
 
 def name_lens(lens: Array) -> Values:
     """Return the parameters of a lens (9,) by their names in loopcal."""
-    names = ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "p1", "p2")
-    return {f"camera.{n}": v for n, v in zip(names, lens, strict=True)}
+    fx, fy, *others = lens
+    names = ("fx", "aspect", "cx", "cy", "k1", "k2", "k3", "p1", "p2")
+    return {f"camera.{n}": v for n, v in zip(names, (fx, fy / fx - 1.0, *others), strict=True)}
 
 
 def predict_errors(machine: Machine, sample: Sample, values: Values) -> Array:

@@ -60,6 +60,22 @@ def test_machines_end_with_the_promised_error(name):
     assert found.data["seen"] > 95.0
 
 
+@pytest.mark.slow
+def test_square_pixels_give_a_board_that_never_turns_a_focal_length():
+    """With another aspect for each camera, a third of such fits ended nowhere."""
+    robot = lc.load_robot("five-bar")
+    instrument, _ = choose_stations(robot, Image(square=0.02), OPTIONS, CALIPER)
+    poses = lc.sample_workspace(robot, 20, 1).coordinates
+    for seed in (0, 1, 6):
+        truth = robot.with_values(sample_truth(robot, 1, seed)[0])
+        fit = lc.identify(robot, lc.simulate(truth, poses, instrument, seed=seed))
+        assert fit.converged
+        place = fit.nuisance.names.index("camera.fx")
+        found, sd = fit.nuisance.estimate[place], fit.nuisance.sd[place]
+        assert sd < 800.0  # [px], of 4000
+        assert abs(found - 4000.0) < 4.0 * sd
+
+
 def test_delta_from_straight_above_would_end_with_a_larger_error():
     """A board that keeps its orientation shows the focal length only at an angle."""
     robot = lc.load_robot("linear-delta")

@@ -143,8 +143,7 @@ def _linearize_pictures(linear: FitLinearization) -> Iterator[tuple[int, Image, 
         values = np.concatenate(values, axis=-1)
         derivative = other.evaluate(poses.T[:, rows.poses], rows.measured[:1], values).nuisance[0]
         by_board, by_focal, by_center = (other.item_values(derivative, n) for n in CHANGING)
-        focal = other.item_values(values[0], "focal")[:, None]
-        zoom = (by_focal * focal).sum(axis=-1, keepdims=True)
+        zoom = by_focal[..., :1] * other.item_values(values[0], "focal")[:, None, :1]
         height = rows.measured[0, :, 2, None, None] / kind.size[1] - 0.5
         columns = np.concatenate([by_board, zoom, by_center, height * np.eye(2)], axis=-1)
         yield number, kind, rows.whiten_columns(rows.whitener[:1], columns[None])[0]

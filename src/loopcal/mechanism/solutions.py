@@ -406,6 +406,11 @@ class Solution(TableResult):
         )
 
 
+def list_commanded(robot: Mechanism) -> BoolArray:
+    """Return which readings (a,) are commanded, which those of conditions are not."""
+    return np.array([actuator.reference is None for actuator in robot.actuators], dtype=bool)
+
+
 def forward(robot: Mechanism, q: ArrayLike, start: Solution | None = None) -> Solution:
     """Solve forward kinematics by Newton's method on the loop closure, beginning at `start`.
 
@@ -425,7 +430,7 @@ def forward(robot: Mechanism, q: ArrayLike, start: Solution | None = None) -> So
     a = len(robot.actuators)
     readings = np.atleast_2d(np.asarray(q, dtype=float))
     is_short = readings.ndim == 2 and readings.shape[1] < a
-    if is_short and readings.shape[1] == (commanded := robot.is_commanded).sum():
+    if is_short and readings.shape[1] == (commanded := list_commanded(robot)).sum():
         known, references = readings, [actuator.reference or 0.0 for actuator in robot.actuators]
         readings = np.tile(references, (len(known), 1))
         readings[:, commanded] = known

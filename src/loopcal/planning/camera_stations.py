@@ -65,7 +65,7 @@ def list_stations(
     tools = (poses.T @ robot.tool)[:, :3, 3]
     center = 0.5 * (tools.min(axis=0) + tools.max(axis=0))
     reach = np.linalg.norm(tools - center, axis=1).max() + np.linalg.norm(middle)
-    slope = 0.5 * FILLED * min(camera.size) / camera.nominal_lens[:2].max()
+    slope = 0.5 * FILLED * min(camera.size) / camera.nominal_lens[0]
     distance = reach * (1.0 + 1.0 / slope)
     step = 10.0 ** np.floor(np.log10(distance / 20.0))  # to which a person places a camera
     home = robot.home[:3, :3]

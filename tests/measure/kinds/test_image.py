@@ -21,14 +21,15 @@ from loopcal.measure.kinds.image import (
 )
 from loopcal.measure.simulation import sample_truth, simulate
 
-LENS_VALUES = np.array([3000.0, 3100.0, 2000.0, 1500.0, 0.1, -0.2, 0.05, 0.001, -0.002])
+LENS_VALUES = np.array([3000.0, 1.0 / 30.0, 2000.0, 1500.0, 0.1, -0.2, 0.05, 0.001, -0.002])
 BOARD = np.array([[0.02 * (i % 9), 0.02 * (i // 9), 0.0] for i in range(54)])
 
 
 def project_by_hand(point, lens):
     """The formulas of OpenCV's documentation, for one point."""
     x, y, z = point
-    fx, fy, cx, cy, k1, k2, k3, p1, p2 = lens
+    fx, aspect, cx, cy, k1, k2, k3, p1, p2 = lens
+    fy = fx * (1 + aspect)
     a, b = x / z, y / z
     r2 = a**2 + b**2
     radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3

@@ -6,7 +6,10 @@ the frame of the camera, whose z axis is the line of sight, a = x / z, b = y / z
 
     g = 1 + k1 s + k2 s^2 + k3 s^3
     u = fx (a g + 2 p1 a b + p2 (s + 2 a^2)) + cx
-    v = fy (b g + p1 (s + 2 b^2) + 2 p2 a b) + cy
+    v = fx (1 + aspect) (b g + p1 (s + 2 b^2) + 2 p2 a b) + cy
+
+Pixels of phones are square: aspect is 0 to `ASPECT_SD`. A board that never turns determines the
+focal length by this alone.
 
 Source: Brown, "Close-range camera calibration", Photogrammetric Engineering 37(8) 855, 1971.
 The closed form of the focal length is that of Zhang, IEEE Transactions on Pattern Analysis and
@@ -34,7 +37,7 @@ from loopcal.numerics.statistics import choose_evenly
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension, Length, Pixel, Ratio
 
-LENS = ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "p1", "p2")  # the order of lens parameters
+LENS = ("fx", "aspect", "cx", "cy", "k1", "k2", "k3", "p1", "p2")  # the order of lens parameters
 NEAREST = 1e-3
 """Share of the distance from the camera below which the depth of a point is not taken, so that a
 point beside or behind the camera has a large, finite residual that leads back."""
@@ -48,13 +51,16 @@ ROUNDING = 1e-12  # relative increase of a sum of squares that is none
 LENS_ITEMS: Mapping[str, tuple[str, ...]] = {
     "focal": LENS[:2], "center": LENS[2:4], "radial": LENS[4:7], "tangential": LENS[7:],
 }  # fmt: skip
-VAGUE = (*LENS_ITEMS["center"], *LENS_ITEMS["tangential"])  # what pictures may leave anywhere
+PIXELS = ("fx", "cx", "cy")  # lens parameters in pixels; others are ratios
+# What pictures of a board that never turns may leave anywhere.
+VAGUE = ("aspect", *LENS_ITEMS["center"], *LENS_ITEMS["tangential"])
 PRINT, BEND = ("scale_x", "scale_y"), ("bend_x", "bend_y", "bend_xy")
 PICTURES = 40  # pictures, evenly chosen, of which start values are made
 # Standard deviations of what nobody measured: a center as a share of the width, a scale of a print,
 # and what a few pictures may not determine of the distortion, three times as large as in phones.
 CENTER_SD, PRINT_SD = 0.02, 0.02
-LENS_SD = {"k3": 0.1, "p1": 0.003, "p2": 0.003}
+ASPECT_SD = 0.002  # of pixels that are as wide as high, by how they are resized and stabilized
+LENS_SD = {"aspect": ASPECT_SD, "k3": 0.1, "p1": 0.003, "p2": 0.003}
 # Sine of the angle between board and line of sight, and width of a square in a picture [px] where
 # it looks narrowest, below which corners are left out. From there on rendered ones are found as
 # exactly as others to a factor of 2; at 76 deg from the normal of 3, and below 15 px of 8.
@@ -67,7 +73,9 @@ def project(
     """Return pixels (.., 2) of points x (.., 3) [m] in the frame of the camera, and their
     derivatives (.., 2, 3) by the points and (.., 2, 9) by the lens (.., 9); without slopes, empty.
     """
-    fx, fy, cx, cy, k1, k2, k3, p1, p2 = (lens[..., i] for i in range(9))
+    fx, aspect, cx, cy, k1, k2, k3, p1, p2 = (lens[..., i] for i in range(9))
+    ratio = 1.0 + aspect
+    fy = fx * ratio
     near = NEAREST * np.sqrt((x * x).sum(axis=-1))
     is_ahead = x[..., 2].real > near.real
     depth = np.where(is_ahead, x[..., 2], np.where(near == 0.0, 1.0, near))
@@ -91,18 +99,24 @@ def project(
     by_point = np.stack(rows, axis=-2)
     zero, one = np.zeros_like(a), np.ones_like(a)
     fa, fb = fx * a * s, fy * b * s
-    of_u = (across, zero, one, zero, fa, fa * s, fa * s * s, fx * 2.0 * ab, fx * (s + 2.0 * aa))
-    of_v = (zero, up, zero, one, fb, fb * s, fb * s * s, fy * (s + 2.0 * bb), fy * 2.0 * ab)
+    bent_u, bent_v = (fx * 2.0 * ab, fx * (s + 2.0 * aa)), (fy * (s + 2.0 * bb), fy * 2.0 * ab)
+    of_u = (across, zero, one, zero, fa, fa * s, fa * s * s, *bent_u)
+    of_v = (ratio * up, fx * up, zero, one, fb, fb * s, fb * s * s, *bent_v)
     by_lens = np.stack(
         [np.stack(np.broadcast_arrays(*row), axis=-1) for row in (of_u, of_v)], axis=-2
     )
     return pixels, by_point, by_lens
 
 
+def list_focal_lengths(lens: FloatArray) -> FloatArray:
+    """Return the focal lengths (.., 2) [px] across and up of a lens (.., 9)."""
+    return np.stack([lens[..., 0], lens[..., 0] * (1.0 + lens[..., 1])], axis=-1)
+
+
 def find_rays(pixels: FloatArray, lens: FloatArray) -> FloatArray:
     """Return (a, b, 1) (.., 3) of pixels (.., 2): the distortion removed by Newton's method."""
     ray = np.ones((*pixels.shape[:-1], 3))
-    ray[..., :2] = plain = (pixels - lens[2:4]) / lens[:2]
+    ray[..., :2] = plain = (pixels - lens[2:4]) / list_focal_lengths(lens)
     for _ in range(10):
         found, by_point, _ = project(ray, lens)
         step = np.linalg.solve(by_point[..., :2], (found - pixels)[..., None])[..., 0]
@@ -155,8 +169,8 @@ def solve_homography(flat: FloatArray, image: FloatArray) -> FloatArray:
 def solve_focal_lengths(
     points: FloatArray, pixels: FloatArray, center: FloatArray
 ) -> FloatArray | None:
-    """Return fx and fy (2,) from pictures (n, k, 2) of points (k, 3) and the center (2,); None
-    where the pictures do not determine them.
+    """Return fx and aspect (2,) from pictures (n, k, 2) of points (k, 3) and the center (2,); None
+    where the pictures do not determine fx.
 
     The first two columns h of a homography are perpendicular and of equal length in the image of
     the absolute conic, diag(1 / fx^2, 1 / fy^2, 1) about the center: two equations a picture.
@@ -175,7 +189,7 @@ def solve_focal_lengths(
         is_determined = rank == columns.shape[1] and s[-1] > max(1e-4 * s[0], LEVEL * scale)
         if is_determined and (weights * (center @ center) > LEVEL).all():
             focal = 1.0 / np.sqrt(weights)
-            return np.broadcast_to(focal, 2).copy()
+            return np.array([focal[0], focal[-1] / focal[0] - 1.0])
     return None
 
 
@@ -331,7 +345,7 @@ class Image(Kind):
     and y down in the picture.
 
     Setup parameters: `camera.rx` to `camera.z`, `board.rx` to `board.z` [rad, m], `camera.fx`,
-    `fy`, `cx`, `cy` [px], `k1`, `k2`, `k3`, `p1`, `p2`, `board.scale_x`, `board.scale_y`, and
+    `cx`, `cy` [px], `aspect`, `k1`, `k2`, `k3`, `p1`, `p2`, `board.scale_x`, `board.scale_y`, and
     `board.bend_x`, `bend_y`, `bend_xy` [m].
 
     mount : what the platform carries, the "board" or the "camera". The base carries the other one.
@@ -343,8 +357,8 @@ class Image(Kind):
     size : width and height of a picture. focal : (fx, fy). Default: the width of the picture.
     center : (cx, cy). Default: the middle of the picture. distortion : (k1, k2, k3, p1, p2).
     corners : columns and rows of corners. square : distance of neighbors, as designed.
-    unknown : which of "camera", "board", "focal", "center", "radial" (k1, k2, k3), "tangential"
-        (p1, p2), "print" (the scales) and "bend" are unknown.
+    unknown : which of "camera", "board", "focal" (fx, aspect), "center", "radial" (k1, k2, k3),
+        "tangential" (p1, p2), "print" (the scales) and "bend" are unknown.
 
     DataError : another mount, a board with fewer than two corners a side, or a length not above 0.
     """
@@ -383,7 +397,7 @@ class Image(Kind):
                 f"a board of {self.corners[0]} x {self.corners[1]} corners at {self.square} m. "
                 "Give at least 2 columns and rows of corners, at a distance above 0"
             )
-        if min(self.size) < 1 or not min(self.nominal_lens[:2]) > 0.0:
+        if min(self.size) < 1 or not min(list_focal_lengths(self.nominal_lens)) > 0.0:
             raise DataError("the size of a picture and the focal length must be above 0")
 
     @classmethod
@@ -427,23 +441,25 @@ class Image(Kind):
         width, height = self.size
         focal = self.focal or (float(width), float(width))
         center = self.center or (0.5 * (width - 1), 0.5 * (height - 1))
-        return np.array([*focal, *center, *self.distortion])
+        return np.array([focal[0], focal[1] / focal[0] - 1.0, *center, *self.distortion])
 
     @cached_property
     def possible_setup(self) -> Mapping[str, setup.SetupItem]:
         """The poses of camera and board, the lens, and the print."""
-        lens, ratio = self.lens or self.camera, Dimension.RATIO
-        numbers = {
-            item: (lens, names, Dimension.PIXEL if item in ("focal", "center") else ratio, nominal)
+        lens, ratio, flat = self.lens or self.camera, Dimension.RATIO, np.zeros(3)
+        stated = dict(zip(LENS, self.nominal_lens[:, None], strict=True))
+        numbers: dict[str, list[tuple[str, Sequence[str], Dimension, FloatArray]]] = {
+            item: [(lens, [n], Dimension.PIXEL if n in PIXELS else ratio, stated[n]) for n in names]
             for item, names in LENS_ITEMS.items()
-            for nominal in (self.nominal_lens[[LENS.index(name) for name in names]],)
         }
-        numbers["print"] = (self.board, PRINT, ratio, np.zeros(len(PRINT)))
-        numbers["bend"] = (self.board, BEND, Dimension.LENGTH, np.zeros(len(BEND)))
+        numbers["print"] = [(self.board, PRINT, ratio, flat[:2])]
+        numbers["bend"] = [(self.board, BEND, Dimension.LENGTH, flat)]
         return {
             "camera": setup.make_frame_item(self.camera, self.T_camera),
             "board": setup.make_frame_item(self.board, self.T_board),
-            **{item: setup.SetupItem(setup.make_parameters(*of)) for item, of in numbers.items()},
+        } | {
+            item: setup.SetupItem(tuple(p for of in parts for p in setup.make_parameters(*of)))
+            for item, parts in numbers.items()
         }
 
     def list_labels(self, r: int) -> FloatArray:
@@ -477,7 +493,7 @@ class Image(Kind):
         x = (camera_board[..., :3, :3] @ p[..., None])[..., 0] + arm
         facing = (normal * x).sum(axis=-1) > GRAZING * np.linalg.norm(x, axis=-1)
         # beyond the largest angle of a picture the polynomial of the distortion may come back
-        reach = 1.5 * np.linalg.norm(self.size) / self.nominal_lens[:2].min()
+        reach = 1.5 * np.linalg.norm(self.size) / self.nominal_lens[0]
         ahead = np.linalg.norm(x[..., :2], axis=-1) < reach * x[..., 2]
         inside = ((columns[..., 1:] >= 0.0) & (columns[..., 1:] < self.size)).all(axis=-1)
         seen = np.concatenate(
@@ -641,7 +657,7 @@ class Image(Kind):
             if not (fit.sd[2:4] < CENTER_SD * max(self.size)).all():  # as if a board never turns
                 fit = calibrate_camera(points, pixels, start, free & ~np.isin(LENS, VAGUE))
             # pictures that do not determine a lens leave it anywhere
-            if np.isfinite(fit.lens).all() and fit.lens[:2].min() > 0.0:
+            if np.isfinite(fit.lens).all() and list_focal_lengths(fit.lens).min() > 0.0:
                 found.append((fit.lens, fit.poses))
         items = {name: [LENS.index(n) for n in names] for name, names in LENS_ITEMS.items()}
         return [({name: of[i] for name, i in items.items()}, poses) for of, poses in found]
