@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -71,22 +73,19 @@ def test_a_log_leads_to_the_true_frame(capsys) -> None:
     assert "Maslow_blX: 0\n" in text
 
 
-def test_a_frame_of_three_millimeters_is_to_be_checked_first(capsys) -> None:
+def test_belts_in_meters_are_refused_by_the_frame(capsys) -> None:
     """Belts alone fit a frame of any size: those in meters one a thousandth as large."""
     write_log(0.8)
     words = "import maslow.yaml --format maslow --probes maslow.log -o m.yaml --data m.csv"
     assert main([*words.split(), "--sigma-line", "1mm"]) == 0
-    *settings, header, rows = Path("m.csv").read_text().partition("pose,bl")
-    lines = rows.splitlines()
-    for k, line in enumerate(lines[1:], 1):
-        pose, *belts = line.split(",")
-        lines[k] = ",".join([pose, *(f"{1e-3 * float(belt):.6f}" for belt in belts)])
-    Path("m.csv").write_text("".join(settings) + header + "\n".join(lines) + "\n")
-    assert main(["calibrate", "m.yaml", "m.csv", "-o", "run", "--hold-out", "0.25"]) == 0
-    assert lc.load_run("run").result["recommendation"]["code"] == "values.check-nominal"
-    words = "export run --format maslow --into maslow.yaml -o new.yaml"
-    assert main(words.split()) == 0
-    assert "does not recommend these values" in " ".join(capsys.readouterr().out.split())
+    robot = lc.load_robot("m.yaml")
+    data = lc.load_measurements("m.csv", robot)
+    for written, said in ((1e-3, "1000 times larger"), (25.4, "25.4 times smaller")):
+        with pytest.raises(lc.DataError, match=said):
+            lc.calibrate(robot, replace(data, readings=written * data.readings))
+    Path("meters.yaml").write_text(re.sub(r": (\d+)", lambda m: f": {int(m[1]) / 1e3}", TAPED))
+    assert main("import meters.yaml --format maslow -o m.yaml --force".split()) == 1
+    assert "span only 2.94 mm" in " ".join(capsys.readouterr().err.split())
 
 
 @pytest.mark.parametrize(

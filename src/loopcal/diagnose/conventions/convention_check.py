@@ -33,6 +33,7 @@ from loopcal.diagnose.conventions.misfit import (
     compute_fitted_misfit,
     compute_quick_misfit,
     exclude_far_rows,
+    find_reading_unit,
     is_redundant,
     judge_data,
     list_rms_residuals,
@@ -187,6 +188,9 @@ def compare_conventions(robot: Mechanism, data: Measurements) -> ConventionCheck
     if n > MOST_POSES and not shares_poses(known):  # runs of neighbors spread over the data
         first = np.linspace(0, n - MOST_POSES // RUNS, RUNS).astype(np.intp)
         thinned = known.take(find_distinct(first[:, None] + np.arange(MOST_POSES // RUNS)))
+    in_other_unit = find_reading_unit(free, thinned) if np.isinf(misfit) else None
+    if in_other_unit is not None:
+        return ConventionCheck(misfit, finding=in_other_unit)
     fitted = compute_fitted_misfit(robot, thinned) if np.isinf(misfit) else np.inf
     if not fitted > ALLOWED:
         return ConventionCheck(fitted)

@@ -61,6 +61,8 @@ FAR, MOST_EXCLUDED = 5.0, 0.25
 # Number of poses that Newton's method does not reach from home at once, and that are tried along
 # a path before all others.
 FOLLOWED = 8
+# Factor by which open loops must close in another unit of the readings before they are refused.
+CLOSER = 20.0
 
 
 class Effort(NamedTuple):
@@ -281,6 +283,29 @@ def compute_fitted_misfit(robot: Mechanism, data: Measurements) -> float:
     if not fit.converged or fit.residual_test.dof <= 0:
         return np.inf
     return float(np.sqrt(fit.residual_test.chi_square / fit.residual_test.dof))
+
+
+def find_reading_unit(free: FreeParameters, data: Measurements) -> Finding | None:
+    """Return the refusal of redundant readings that close the loops of the robot far better in
+    another unit; None without one. A fit would shrink the robot to such readings.
+    """
+    robot = free.robot
+    if robot.redundancy is None:
+        return None
+    few = data.take(choose_evenly(data.n_poses, FOLLOWED))
+
+    def measure_gap(read: Measurements) -> float:
+        return float(np.median(forward(robot, read.readings).residual))
+
+    gap, units = measure_gap(few), list_reading_interpretations(few, robot.actuators)
+    gaps = {u: measure_gap(u.apply(few)) for u in units if u.slip == "unit"}
+    best = min(gaps, key=gaps.__getitem__)
+    if not gaps[best] * CLOSER < gap:
+        return None
+    found = {"gap": robot.describe_gap(gap), "other_gap": robot.describe_gap(gaps[best])}
+    return report_finding(
+        "conventions.readings-in-other-unit", robot=robot.name, **found, **best.details
+    )
 
 
 def _linearize(

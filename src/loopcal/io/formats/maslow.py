@@ -44,6 +44,7 @@ BELTS = ("bl", "br", "tr", "tl")  # belts in the order of CLBM, which is that of
 # Coordinates by which the firmware defines its frame.
 ORIGIN = ("bl.anchor.x", "bl.anchor.y", "br.anchor.y")
 ANCHOR_SD = 30.0  # tolerance of anchors that were taped [mm]
+SMALLEST = 100.0  # size of a frame that is one in millimeters [mm]
 BLOCK = re.compile(r"CLBM:\s*\[(.*?)\]")
 WAYPOINT = re.compile(
     r"\{" + r",\s*".join(rf"{belt}:\s*([^\s,{{}}]+)" for belt in BELTS) + r"\s*\}"
@@ -72,6 +73,8 @@ def read(path: Path, options: ImportOptions) -> Imported:
     sigma = options.choose_noise("line") / MM
     corners = np.array(list(anchors.values()))
     low, high = corners.min(axis=0), corners.max(axis=0)
+    if (size := float((high - low).max())) < SMALLEST:
+        raise FileError(report_finding("files.frame-in-meters", size=Quantity(size, "mm")), path)
     drive = {"reads": "length", "sigma": round_digits(sigma)}
     anchor = {"of": "base", "shift": ["x", "y"], "name": "anchor", "tolerance": {"sd": ANCHOR_SD}}
     content: dict[str, Any] = {
