@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Corners in rendered pictures against the truth, and pictures that are left out."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -16,6 +17,7 @@ from loopcal.io.pictures import (
     choose_board,
     compare_pictures,
     examine_picture,
+    find_two_cameras,
     format_contact_sheet,
     list_pictures,
     name_poses,
@@ -132,6 +134,24 @@ def test_other_sizes_other_zooms_and_copies_are_left_out(tmp_path) -> None:
     assert "http" not in page
     with pytest.raises(DataError, match="no residuals of these pictures"):
         format_contact_sheet(found, names, [])
+
+
+def test_pictures_of_two_cameras_without_exif_are_divided() -> None:
+    rng, pictures = np.random.default_rng(2), []
+    other = LENS * np.array([1.05, 1.05, 1.01, 0.99, 1.2, 1.2, 1.2, 1.2, 1.2])
+    number = np.arange(BOARD.corners[0] * BOARD.corners[1])
+    for i in range(12):
+        T = make_pose(exp_so3(0.25 * rng.normal(size=3)), np.array([-0.06, -0.04, 0.24]))
+        pixels = project_corners(BOARD, T, other if i % 3 == 0 else LENS)
+        pixels = pixels + 0.03 * rng.normal(size=pixels.shape)
+        pictures.append(Picture(Path(f"{i}.jpg"), SIZE, None, number, pixels))
+    found = find_two_cameras(BOARD, pictures)
+    assert found is not None
+    groups = {found["first"], found["second"]}
+    assert ("0.jpg", "3.jpg", "6.jpg", "9.jpg") in groups
+    one = [picture for i, picture in enumerate(pictures) if i % 3]
+    assert find_two_cameras(BOARD, one) is None
+    assert find_two_cameras(BOARD, [replace(p, focal=1010.0) for p in pictures]) is None
 
 
 def test_poses_are_names_of_pictures_or_rows_of_a_table(tmp_path) -> None:

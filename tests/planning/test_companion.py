@@ -266,6 +266,27 @@ def test_noise_above_the_stated_one_widens_what_is_said() -> None:
     assert "companion.scatter" in codes
 
 
+def test_noise_below_the_stated_one_saves_poses_and_wrong_spreads_do_not() -> None:
+    """Repeats show the noise; a machine that is nominal, with wide spreads, shows none."""
+    machine, counts = make_machine(), []
+    poses = machine.fit[:5] * 3
+    used, (observed,) = np.ones(15, dtype=bool), machine.measure(poses).observations
+    exact = machine.exact.observations[0].measured[poses]
+    for times in (1.0, 0.3):
+        values = exact + times * (observed.measured - exact)
+        measured = replace(
+            machine.measure(poses), observations=(replace(observed, measured=values),)
+        )
+        state = co.take_rows(machine.task, measured, poses, used)
+        assert state.scale == 1.0
+        counts.append(co.choose_next(state).left)
+        assert state.noise == pytest.approx(1.2 * times, rel=0.2)
+    assert 0 <= counts[1] < counts[0]
+    first = machine.measure(machine.fit[:8])  # 24 values of a machine of 42 parameters
+    alone = co.take_rows(machine.task, first, machine.fit[:8], np.ones(8, dtype=bool))
+    assert alone.noise == 1.0
+
+
 def test_uncertain_readings_widen_the_expected_value() -> None:
     machine = make_machine()
     exact = follow(machine, machine.fit[:8])[1][-1].prediction.sd

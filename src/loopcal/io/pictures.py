@@ -301,6 +301,10 @@ SAME_PIXEL = 1e-3  # difference up to which two corners are the same: files have
 FULL_FRAME = 43.2666  # diagonal of the film that focal lengths of phones refer to [mm]
 # Difference of focal lengths, as a share, from which a picture is of another zoom.
 SAME_FOCAL = 0.01
+# Pictures of one of two cameras at least, how often they are divided anew, and how many times
+# smaller the residuals of two cameras are from where they are named: those of one camera, divided
+# at random, up to 1.3 times.
+LEAST_PICTURES, DIVISIONS, TWO_CAMERAS = 4, 6, 1.6
 
 
 @dataclass(frozen=True)
@@ -510,6 +514,64 @@ def compare_pictures(pictures: Sequence[Picture]) -> tuple[Picture, ...]:
                 fault = report_finding("pictures.zoomed", focal=numbers[0], other=numbers[1])
         checked.append(replace(picture, fault=fault))
     return tuple(checked)
+
+
+def find_two_cameras(board: Board, pictures: Sequence[Picture]) -> dict[str, Any] | None:
+    """Return the pictures of each of two cameras that fit the corners far better than one, with
+    free poses of the board, and how many times; None without such, where EXIF states focal lengths, and of too few pictures.
+
+    Pictures are divided by the focal lengths that each has alone, with the lens of all and without
+    distortion, and then by the camera that fits them better.
+    """
+    good = [picture for picture in pictures if picture.fault is None]
+    if len(good) < 2 * LEAST_PICTURES or all(picture.focal for picture in good):
+        return None
+    cv2, names = import_optional("cv2", "camera"), [picture.path.name for picture in good]
+    seen = [picture.pixels[:, None].astype(np.float32) for picture in good]
+    places = [np.stack(np.divmod(p.corners, board.corners[0])[::-1], axis=1) for p in good]
+    flat = [np.pad(board.square * place, ((0, 0), (0, 1))).astype(np.float32) for place in places]
+    size, every = good[0].size, np.arange(len(good))
+
+    def fit(chosen: IntArray, lens: Any = (None, None), fixed: int = 0) -> tuple[float, Any]:
+        of_chosen = [[rows[i] for i in chosen] for rows in (flat, seen)]
+        start = (None if part is None else part.copy() for part in lens)
+        rms, *lens = cv2.calibrateCamera(*of_chosen, size, *start, flags=fixed)[:3]
+        return rms, lens
+
+    def measure(lens: Any) -> FloatArray:
+        found = []
+        for place, pixels in zip(flat, seen, strict=True):
+            _, *pose = cv2.solvePnP(place, pixels, *lens)
+            found.append(np.square(cv2.projectPoints(place, *pose, *lens)[0] - pixels).sum())
+        return np.array(found)
+
+    one, lens = fit(every)
+    middle = 0.5 * (np.array(size) - 1.0)
+    plain = np.array([[size[0], 0.0, middle[0]], [0.0, size[0], middle[1]], [0.0, 0.0, 1.0]])
+    only_focal = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_PRINCIPAL_POINT
+    only_focal |= cv2.CALIB_FIX_ASPECT_RATIO | cv2.CALIB_FIX_TANGENT_DIST
+    only_focal |= cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3
+    best, groups = np.inf, (every, every)
+    for begin in (lens, (plain, np.zeros(5))):
+        focal = np.array([fit(every[i : i + 1], begin, only_focal)[1][0][0, 0] for i in every])
+        order = np.argsort(focal)
+        cuts = range(LEAST_PICTURES, len(good) - LEAST_PICTURES + 1)
+        halves = {k: (focal[order[:k]], focal[order[k:]]) for k in cuts}
+        cut = min(cuts, key=lambda k: sum(len(half) * half.var() for half in halves[k]))
+        is_first = np.isin(every, order[:cut])
+        for _ in range(DIVISIONS):
+            if min(is_first.sum(), (~is_first).sum()) < LEAST_PICTURES:
+                break
+            two = [measure(fit(every[own])[1]) for own in (is_first, ~is_first)]
+            is_first = two[0] < two[1]
+            square = float(np.minimum(*two).sum())
+            if square < best:
+                best, groups = square, (every[is_first], every[~is_first])
+    times = one / np.sqrt(best / sum(map(len, seen)))
+    if times < TWO_CAMERAS or min(map(len, groups)) < LEAST_PICTURES:
+        return None
+    first, second = (tuple(names[i] for i in group) for group in groups)
+    return {"times": times, "first": first, "second": second}
 
 
 def name_poses(paths: Sequence[Path], names: Path | None = None) -> dict[Path, str]:

@@ -21,17 +21,18 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import islice
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 from loopcal.errors import DataError
 from loopcal.estimate.information import ObservedPoses, observe_poses, observe_rows
-from loopcal.estimate.residual_test import FEWEST_DEGREES, SIGNIFICANCE
+from loopcal.estimate.residual_test import FEWEST_DEGREES, NO_NOISE, SIGNIFICANCE
 from loopcal.findings import Finding, report_finding
 from loopcal.measure.initial_values import guess_nuisance_values_batch
 from loopcal.measure.instrument import Instrument
@@ -42,6 +43,7 @@ from loopcal.mechanism.platform_coordinates import read_coordinates
 from loopcal.mechanism.solutions import forward
 from loopcal.numerics.decomposition import are_nonzero
 from loopcal.numerics.statistics import (
+    compute_chi_square_quantile,
     compute_chi_square_tail,
     compute_f_tail,
     compute_single_level,
@@ -69,6 +71,9 @@ OPEN = 1e-6
 # Standard deviation of a setup parameter, in radians or in sizes of the robot, above which its rows
 # are not linear.
 FAR = 0.1
+# Share of the variance of a combination of measured values that the spreads of the machine explain,
+# up to which it shows the noise.
+QUIET = 0.1
 STEPS = 20  # of the iteration to the estimate
 SETTLED = 1e-6  # squared length [standard deviations] of a step at which it ends
 # Difference of sums of squares up to which another row may be the wrong one, and the largest number
@@ -194,6 +199,7 @@ class VisitFit:
     prior: FloatArray  # (., k + 1) whitened rows of the spreads there
     cost: float  # sum of squares at x
     solution: PartialSolution
+    used: BoolArray  # (n,) visits
 
     @property
     def is_located(self) -> bool:
@@ -209,6 +215,24 @@ class VisitFit:
         if degrees < FEWEST_DEGREES or compute_chi_square_tail(degrees, cost) >= SIGNIFICANCE:
             return 1.0, np.inf
         return float(np.sqrt(cost / degrees)), float(degrees)
+
+    def measure_noise(self) -> tuple[float, float]:
+        """Return the whitened sum of squares, and its degrees of freedom, of what the used rows
+        show that neither setup nor machine explains.
+
+        With the influence matrix H = A (A'A)^-1 A' = U diag(h) U' of the measured rows, an element
+        of U'r / (1 - h) has the variance of the noise and h / (1 - h) by the spreads. So wrong
+        spreads never make the noise too small.
+        """
+        rows = self.rows.white[self.used].reshape(-1, len(self.x) + 1)
+        rows = rows[rows.any(axis=1)]
+        u, s, _ = np.linalg.svd(rows[:, :-1] @ self.solution.root)
+        share = np.zeros(len(rows))
+        share[: len(s)] = s**2
+        is_quiet = share < QUIET
+        residual = rows[:, -1] + rows[:, :-1] @ self.solution.step
+        shown = u[:, is_quiet].T @ residual / (1.0 - share[is_quiet])
+        return float(shown @ shown), float(is_quiet.sum())
 
 
 def observe_visits(task: CompanionTask, measured: Measurements, x: FloatArray) -> VisitRows:
@@ -262,7 +286,7 @@ def linearize_visits(
     size = {Dimension.LENGTH: task.robot.size}
     unit = np.array([size.get(dimension, 1.0) for dimension in table.dimensions] + [np.inf] * p)
     square = float((stacked[:, -1] ** 2).sum())
-    return VisitFit(x, unit, rows, prior, square, solve_rows(stacked, unit))
+    return VisitFit(x, unit, rows, prior, square, solve_rows(stacked, unit), used)
 
 
 def fit_visits(
@@ -349,6 +373,22 @@ class Companion:
     def scale(self) -> float:
         """Noise in units of the stated one."""
         return 1.0 if self.fit is None else self.fit.scale[0]
+
+    @cached_property
+    def noise(self) -> float:
+        """Noise that the accuracy is computed with: 1, the stated one, unless the rows contradict
+        it with the confidence of the goal. Then it is theirs; of a smaller one, the upper limit.
+        Where they contradict the spreads as well, `scale` counts instead.
+        """
+        if self.fit is None or not self.fit.is_located or self.scale > 1.0:
+            return 1.0
+        square, degrees = self.fit.measure_noise()
+        if degrees < FEWEST_DEGREES or square < NO_NOISE**2 * degrees:
+            return 1.0
+        share = self.task.problem.options.share
+        if compute_chi_square_tail(degrees, square) < 1.0 - share:
+            return float(np.sqrt(square / degrees))
+        return min(1.0, float(np.sqrt(square / compute_chi_square_quantile(degrees, share))))
 
     @cached_property
     def used(self) -> tuple[int, ...]:
@@ -536,11 +576,12 @@ def _describe_worst(
 
 def predict_accuracy(companion: Companion, more: Sequence[int] = ()) -> ExpectedErrors | None:
     """Return the errors over the workspace by the used rows, and `more` poses of the sheet; None
-    while nothing bounds them. Noise above the stated one widens them.
+    while nothing bounds them. The noise is what the rows show of it; rows that contradict noise and
+    spreads widen all errors.
     """
     task, scale = companion.task, companion.scale
     chosen = np.array([*companion.fitted, *more], dtype=np.int64)
-    errors = task.problem.predict_errors(chosen)
+    errors = task.problem.predict_errors(chosen, companion.noise)
     if errors is None or scale == 1.0:
         return errors
     names = (f"{name}{rms}" for name in DIMENSIONS for rms in ("", "_rms"))
@@ -582,16 +623,22 @@ def choose_next(
     others = [i for i in range(len(at)) if i not in companion.used and i not in skipped]
     free = [i for i in others if not task.is_held_out[i]]
     validating = [i for i in others if task.is_held_out[i]]
-    order = order_by_gain(companion, free, minutes, goal is not None)
+    gaining, order = order_by_gain(companion, free, minutes, goal is not None), list[int]()
 
     def is_enough(count: int) -> bool:
+        order.extend(islice(gaining, max(count - len(order), 0)))
         errors = predict_accuracy(companion, order[:count])
         return goal is not None and errors is not None and errors.select(target) <= goal
 
     left: int | None = len(free)
-    if goal is not None:
-        left = bisect_left(range(len(order) + 1), True, key=is_enough)
-        left = None if left > len(order) else left
+    if goal is None:
+        order.extend(gaining)
+    else:
+        high = 1
+        while not is_enough(high) and len(order) == high:
+            high *= 2
+        left = bisect_left(range(high + 1), True, lo=high // 2, key=is_enough)
+        left = None if left > high else left
     total = None
     if left is not None and task.pace.minutes is not None:
         path = [*order[:left], *validating]
@@ -622,30 +669,32 @@ def choose_next(
 
 def order_by_gain(
     companion: Companion, free: Sequence[int], minutes: FloatArray, repeats: bool
-) -> list[int]:
-    """Return poses in the order in which each gains most per minute: by how much the logarithm of
+) -> Iterator[int]:
+    """Yield poses in the order in which each gains most per minute: by how much the logarithm of
     the mean variance over the workspace falls. minutes : (n,) of each pose as the next one.
 
     repeats : whether poses that were measured follow, up to MOST_REPEATS in all.
     """
-    task, scaled = companion.task, companion.task.scaled
-    left, order = list(free), list[int]()
+    task, scaled = companion.task, companion.task.scaled / companion.noise
+    left, count = list(free), 0
     usable = np.flatnonzero(~task.is_held_out & scaled.any(axis=(1, 2))).tolist()
     rows = scaled[companion.fitted].reshape(-1, scaled.shape[2])
     most = max(len(left), MOST_REPEATS) if repeats else len(left)
-    R = task.scoring.factor(rows)
-    while len(order) < most and (left or usable):
+    R, is_regular = task.scoring.factor(rows), False
+    while count < most and (left or usable):
         among, at = left or usable, R
-        if not is_determined(R):
+        is_regular = is_regular or is_determined(R)
+        if not is_regular:
             at = factor_square(np.concatenate([R, RIDGE * np.eye(len(R))]))
         terms = compute_swap_terms(task.scoring, at, scaled[among])
-        gain = score_additions(terms) / (1.0 if order else minutes[among])
+        gain = score_additions(terms) / (1.0 if count else minutes[among])
         # of poses that gain equally but for rounding, as on a symmetric machine, the first one
-        order.append(among[int(np.argmax(gain >= gain.max() - TIE))])
-        R = factor_square(np.concatenate([R, scaled[order[-1]]]))
-        if order[-1] in left:
-            left.remove(order[-1])
-    return order
+        best = among[int(np.argmax(gain >= gain.max() - TIE))]
+        yield best
+        count += 1
+        R = factor_square(np.concatenate([R, scaled[best]]))
+        if best in left:
+            left.remove(best)
 
 
 def report_progress(companion: Companion, following: NextPose) -> tuple[Finding, ...]:

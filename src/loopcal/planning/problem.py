@@ -261,10 +261,12 @@ class PlanningProblem:
         rows = self.groups.rows if rows is None else rows
         return DesignProblem(rows, self.build_criterion(name), self.prior, counted=self.counted)
 
-    def predict_errors(self, chosen: IntArray) -> ExpectedErrors | None:
-        """Return the errors expected after measuring groups (n,); None if unbounded."""
+    def predict_errors(self, chosen: IntArray, noise: float = 1.0) -> ExpectedErrors | None:
+        """Return the errors expected after measuring groups (n,) with so many times the stated
+        noise; None if unbounded.
+        """
         if len(chosen):
-            factor = factor_design(self.groups.rows[chosen], self.prior, self.space)
+            factor = factor_design(self.groups.rows[chosen] / noise, self.prior, self.space)
         else:
             # no row of the prior has both nuisance and machine columns, see `combine_prior`
             rows = self.prior.rows[:, self.prior.n_nuisance :] @ self.space.machine

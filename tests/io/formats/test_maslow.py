@@ -84,7 +84,7 @@ def test_belts_in_meters_are_refused_by_the_frame(capsys) -> None:
         with pytest.raises(lc.DataError, match=said):
             lc.calibrate(robot, replace(data, readings=written * data.readings))
     Path("meters.yaml").write_text(re.sub(r": (\d+)", lambda m: f": {int(m[1]) / 1e3}", TAPED))
-    assert main("import meters.yaml --format maslow -o m.yaml --force".split()) == 1
+    assert main(["import", "meters.yaml", "--format", "maslow", "-o", "m.yaml", "--force"]) == 1
     assert "span only 2.94 mm" in " ".join(capsys.readouterr().err.split())
 
 

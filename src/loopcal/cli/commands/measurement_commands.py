@@ -627,6 +627,9 @@ def photos(
             found[path] = answer.result or of.Picture(path, fault=lost)
             progress(len(found), len(paths), "finding corners")
     pictures = of.compare_pictures([found[path] for path in paths])
+    two_cameras = of.find_two_cameras(known, pictures)
+    if two_cameras is not None:
+        terminal.print_finding("pictures.two-cameras", **two_cameras)
     texts = {
         output: of.format_pictures(
             known, pictures, names, mount, sigma, beside, of.list_cameras(poses)
