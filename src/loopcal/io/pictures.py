@@ -518,7 +518,8 @@ def compare_pictures(pictures: Sequence[Picture]) -> tuple[Picture, ...]:
 
 def find_two_cameras(board: Board, pictures: Sequence[Picture]) -> dict[str, Any] | None:
     """Return the pictures of each of two cameras that fit the corners far better than one, with
-    free poses of the board, and how many times; None without such, where EXIF states focal lengths, and of too few pictures.
+    free poses of the board, and how many times; None without such, where EXIF has focal lengths,
+    and of too few pictures.
 
     Pictures are divided by the focal lengths that each has alone, with the lens of all and without
     distortion, and then by the camera that fits them better.
