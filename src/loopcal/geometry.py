@@ -19,7 +19,8 @@ import numpy as np
 from loopcal import engine
 from loopcal.errors import DataError
 from loopcal.numerics.decomposition import are_nonzero
-from loopcal.typing import FloatArray, IntArray
+from loopcal.numerics.elimination import eliminate_from_triangle
+from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension
 
 # Added to squared lengths before the square root: far below any square that matters, far above the
@@ -627,25 +628,63 @@ def align_point_sets(points: FloatArray, reference: FloatArray) -> FloatArray:
     return make_pose(R, center - R @ middle)
 
 
-def minimize_over_rotations(H: FloatArray, g: FloatArray, count: int = 3) -> list[FloatArray]:
+def minimize_over_rotations(
+    H: FloatArray,
+    g: FloatArray,
+    count: int = 3,
+    constant: FloatArray | None = None,
+    worth: float = np.inf,
+) -> list[FloatArray]:
     """Return for each of s forms the rotations (k, 3, 3) at the lowest local minima of
     `v' H v - 2 g' v`, at most `count` different ones, for positive semidefinite H (s, 9, 9).
 
-    The vector v holds the nine entries of R row by row. Newton's method on the rotation group, with
-    the absolute curvatures and a radius that a failed step quarters, begins at the rotation nearest
-    to the unconstrained minimum and at the 24 rotations of a cube. Of starts that meet, one goes
-    on. Near a minimum it converges quadratically however large the residual is, where Gauss-Newton
-    does not.
+    The vector v holds the nine entries of R row by row. Newton's method on the rotation group
+    begins at the rotation nearest to the unconstrained minimum and at the 24 rotations of a cube.
+
+    With a `constant` (s,), which makes the forms sums of squares, the cube is left out where every
+    other minimum is proven to have more than `worth` times the sum of the first one. Let F be the
+    sum less that of the unconstrained minimum, and a and b the smallest and the largest eigenvalue
+    of H. On the shortest path between two rotations with F < a^2 / b, F is at most twice as large,
+    and half its second derivative, at least 2 a - sqrt(2 b F), is positive: of both only one is a
+    minimum.
     """
-    free = (np.linalg.pinv(H, rcond=ALIGNMENT_TOLERANCE) @ g[..., None]).reshape(-1, 1, 3, 3)
-    cube = np.broadcast_to(OCTAHEDRAL_ROTATIONS, (len(H), *OCTAHEDRAL_ROTATIONS.shape))
-    R = np.concatenate([project_to_rotations(free), cube], axis=1).reshape(-1, 3, 3)
-    of = np.repeat(np.arange(len(H)), 1 + len(OCTAHEDRAL_ROTATIONS))
-    size = np.maximum(np.trace(H, axis1=1, axis2=2), TINY)[:, None]
-    H, g = H / size[..., None], g / size  # values and curvatures of order one
+    scale = np.maximum(np.trace(H, axis1=1, axis2=2), TINY)[:, None]
+    H, g = H / scale[..., None], g / scale  # values and curvatures of order one
+    size, axes = np.linalg.eigh(H)
+    along = (g[:, None] @ axes)[:, 0]
+    is_used = size > ALIGNMENT_TOLERANCE * size[:, -1:]
+    free = np.divide(along, size, out=np.zeros_like(along), where=is_used)
+    R = project_to_rotations((axes @ free[..., None]).reshape(-1, 1, 3, 3))
+    is_only = np.zeros(len(H), dtype=bool)
+    if constant is not None and worth < np.inf:
+        R, value, _ = _descend_over_rotations(H, g, R)
+        rest = constant / scale[:, 0] - (along * free).sum(axis=1)
+        most = worth * (value[:, 0] + constant / scale[:, 0]) - rest
+        is_only = size[:, -1] * np.maximum(most, ROUNDING) < np.maximum(size[:, 0], 0.0) ** 2
+    ends, others = list(R), np.flatnonzero(~is_only)
+    if others.size:
+        cube = np.broadcast_to(OCTAHEDRAL_ROTATIONS, (len(others), *OCTAHEDRAL_ROTATIONS.shape))
+        begin = np.concatenate([R[others], cube], axis=1)
+        found = zip(*_descend_over_rotations(H[others], g[others], begin), strict=True)
+        for i, (r, v, on) in zip(others, found, strict=True):
+            ends[i] = r[on][np.argsort(v[on])[:count]]
+    return ends
+
+
+def _descend_over_rotations(
+    H: FloatArray, g: FloatArray, begin: FloatArray
+) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Return where Newton's method leads from rotations (s, c, 3, 3), the values (s, c) of the
+    forms there, and which starts went on to their end.
+
+    It takes the absolute curvatures, and a radius that a failed step quarters. Of starts that meet,
+    one goes on. Near a minimum it converges quadratically however large the residual is, where
+    Gauss-Newton does not.
+    """
+    R, of = begin.reshape(-1, 3, 3).copy(), np.repeat(np.arange(len(H)), begin.shape[1])
     value = _evaluate_form(H[of], g[of], R)
-    radius, active, order = np.ones(len(R)), np.arange(len(R)), np.arange(len(R) // len(H))
-    goes_on = np.ones((len(H), len(order)), dtype=bool)
+    radius, active, order = np.ones(len(R)), np.arange(len(R)), np.arange(begin.shape[1])
+    goes_on = np.ones(begin.shape[:2], dtype=bool)
     for _ in range(NEWTON_STEPS):
         if not active.size:
             break
@@ -662,8 +701,7 @@ def minimize_over_rotations(H: FloatArray, g: FloatArray, count: int = 3) -> lis
         meets = entries @ np.swapaxes(entries, 1, 2) >= 3.0 - MEETING**2  # 1 + 2 cos(angle)
         goes_on &= np.argmax(meets & goes_on[:, None], axis=2) == order
         active = active[(longest > ROTATION_CHANGE) & goes_on.ravel()[active]]
-    ends = zip(np.split(R, len(H)), np.split(value, len(H)), goes_on, strict=True)
-    return [r[on][np.argsort(v[on])[:count]] for r, v, on in ends]
+    return R.reshape(begin.shape), value.reshape(goes_on.shape), goes_on
 
 
 def _evaluate_form(H: FloatArray, g: FloatArray, R: FloatArray) -> FloatArray:
@@ -737,14 +775,14 @@ def solve_hand_eye(
 
 
 def solve_frame_and_points(
-    measured: FloatArray, moving: FloatArray, constant: FloatArray
+    measured: FloatArray, moving: FloatArray, constant: FloatArray, worth: float = np.inf
 ) -> tuple[FloatArray, FloatArray, IntArray]:
     """Return candidates of a frame (k, 4, 4) and of the coordinates p (k, w) of points on a moving
     body with `R measured + t = moving p + constant`, for s sets of measured (s, q, 3), NaN where
     missing, moving (s, q, 3, w) and constant (s, q, 3); and the set (k,) of each, in order.
 
     For a given rotation R the other unknowns enter linearly. Eliminating them leaves a quadratic
-    form of R.
+    form of R; `worth` as of `minimize_over_rotations`.
     """
     (s, q), w = measured.shape[:2], moving.shape[-1]
     is_there = np.asarray(~np.isnan(measured).any(axis=-1))[..., None]
@@ -754,18 +792,13 @@ def solve_frame_and_points(
     known = np.where(is_there, measured, 0.0)
     M = (np.eye(3)[:, :, None] * known[:, :, None, None, :]).reshape(s, 3 * q, 9)
     b = (constant * is_there).reshape(s, 3 * q, 1)
-    rows = engine.fold(np.zeros((s, w + 13, w + 13)), np.concatenate([C, M, b], axis=-1))
-    C, both, M, b = rows[..., : w + 3], rows[..., w + 3 :], rows[..., w + 3 : -1], rows[..., -1:]
-    Q, size, V = np.linalg.svd(C, full_matrices=False)
-    used = are_nonzero(size, ALIGNMENT_TOLERANCE)[:, None, :]
-    Q = Q * used
-    out = both - Q @ (np.swapaxes(Q, 1, 2) @ both)
-    form = np.swapaxes(out[..., :9], 1, 2) @ out
-    rotations = minimize_over_rotations(form[..., :9], form[..., 9])
+    R, u = engine.fold(np.zeros((s, w + 13, w + 13)), np.concatenate([C, M, b], axis=-1)), w + 3
+    done = eliminate_from_triangle(R[:, :u, :u], R[:, :u, u:], R[:, u:, u:])
+    form, least = np.swapaxes(done.rest[..., :9], 1, 2) @ done.rest, done.rest[..., 9]
+    given = form[..., :9], form[..., 9], 3, (least * least).sum(axis=1)
+    rotations = minimize_over_rotations(*given, worth)
     of, R = np.repeat(np.arange(s), [len(each) for each in rotations]), np.concatenate(rotations)
-    inverse = np.swapaxes(V, 1, 2) / np.where(used, size[:, None, :], np.inf)
-    left = np.swapaxes(Q, 1, 2)[of] @ (M[of] @ R.reshape(-1, 9, 1) - b[of])
-    rest = (inverse[of] @ left)[..., 0]
+    rest = (done.solution[..., :9][of] @ R.reshape(-1, 9, 1))[..., 0] - done.solution[of, :, 9]
     return make_pose(R, rest[:, w:]), rest[:, :w], of
 
 

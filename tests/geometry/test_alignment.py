@@ -46,3 +46,23 @@ def test_rotation_of_points_in_a_plane_is_recovered(seed):
     b = (points @ truth.T).ravel()
     R = minimize_over_rotations((A.T @ A)[None], (A.T @ b)[None])[0][0]
     assert np.abs(R - truth).max() < 1e-9
+
+
+@pytest.mark.parametrize("worth", [1.5, 4.0, 100.0])
+def test_minimum_that_is_returned_alone_is_the_lowest_and_all_others_cost_more(worth):
+    rng = np.random.default_rng(5)
+    A = rng.normal(size=(100, 12, 9)) * np.linspace(0.2, 1.0, 9)
+    truth = Rotation.from_quat(rng.normal(size=(100, 4))).as_matrix()
+    b = (A @ truth.reshape(100, 9, 1))[..., 0]
+    b += rng.normal(size=b.shape) * np.geomspace(1e-6, 1.0, 100)[:, None]
+    forms = np.swapaxes(A, 1, 2) @ A, (np.swapaxes(A, 1, 2) @ b[..., None])[..., 0], 24
+    certain, number = minimize_over_rotations(*forms, (b * b).sum(axis=1), worth), [0, 0]
+    whole = minimize_over_rotations(*forms)
+    for rows, wanted, some, others in zip(A, b, certain, whole, strict=True):
+        costs = [cost(R, rows, wanted) for R in others]
+        assert cost(some[0], rows, wanted) == pytest.approx(costs[0], rel=1e-6)
+        if len(some) < len(costs):
+            assert len(some) == 1
+            assert costs[1] > worth * costs[0]
+        number[len(some) == len(costs)] += len(costs) > 1
+    assert min(number) > 5  # forms with several minima of which one, or all, were returned

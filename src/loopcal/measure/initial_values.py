@@ -354,7 +354,13 @@ def _refine_candidates(
     whitener = spread((rows.whitener[groups.rows] * groups.is_row[..., None, None])[None])
     is_row, kept = spread(groups.is_row[None]), groups.is_kept
     is_strict = t == 1 and not kept.any()
-    candidates = _collect_candidates(kind, poses, columns, is_row, is_strict)
+    worth, is_plain = np.inf, not (kind.is_of_base or kind.shared_errors or kept.any())
+    if is_plain and isinstance(kind, Position) and {"frame", "targets"} <= set(kind.unknown):
+        # minima for equal noise: each is left where another one is lower for any other noise, too
+        size = np.abs(np.einsum("...mm->...m", whitener))
+        if np.count_nonzero(size) == np.count_nonzero(whitener):
+            worth = AS_LOW * (size.max() / size.min(where=size > 0.0, initial=np.inf)) ** 2
+    candidates = _collect_candidates(kind, poses, columns, is_row, is_strict, worth)
     k, own = candidates.shape[1], values.reshape(t * g, 1, -1)
     candidates = np.where(kept, own, candidates).reshape(t * g * k, -1)
 
@@ -374,12 +380,6 @@ def _refine_candidates(
         cost = sum_squares(whiten(candidates, sets)[0]).reshape(t * g, k)
         chosen = (np.argsort(cost, axis=1)[:, :most] + k * np.arange(t * g)[:, None]).ravel()
         candidates, sets, k = candidates[chosen], sets[chosen], most
-    worth, is_plain = np.inf, not (kind.is_of_base or kind.shared_errors or kept.any())
-    if is_plain and isinstance(kind, Position) and {"frame", "targets"} <= set(kind.unknown):
-        # minima for equal noise: each is left where another one is lower for any other noise, too
-        size = np.abs(np.einsum("...mm->...m", whitener))
-        if np.count_nonzero(size) == np.count_nonzero(whitener):
-            worth = AS_LOW * (size.max() / size.min(where=size > 0.0, initial=np.inf)) ** 2
     refined, cost = minimize_from_starts(
         lambda x, which: whiten(x, sets[which]), candidates, steps, GOOD_START, sets, worth
     )
@@ -390,14 +390,21 @@ def _refine_candidates(
 
 
 def _collect_candidates(
-    kind: Kind, poses: FloatArray, measured: FloatArray, is_row: BoolArray, is_strict: bool
+    kind: Kind,
+    poses: FloatArray,
+    measured: FloatArray,
+    is_row: BoolArray,
+    is_strict: bool,
+    worth: float,
 ) -> FloatArray:
-    """Return the candidates of a kind for each set of measured values, the nominal values last, (s,
-    k, u). Data that leave some parameters open may do for the others: without a closed form,
-    frames are spread unless this `is_strict`.
+    """Return the candidates of a kind for each set of measured values, (s, k, u), the nominal
+    values last unless `worth` tells that candidates are minima. Data that leave some parameters
+    open may do for the others: without a closed form, frames are spread unless this `is_strict`.
     """
     offered, own = [], kind.without_shared_errors() if kind.shared_errors else kind
-    for guesses in own.guess_sets(poses, measured, is_row):
+    given = poses, measured, is_row
+    sets = own.guess_sets(*given, worth) if isinstance(own, Position) else own.guess_sets(*given)
+    for guesses in sets:
         if not isinstance(guesses, DataError):
             shared = len(kind.nominal_values) - guesses.shape[1]  # a bias or drift begins at zero
             candidates = np.concatenate([guesses, np.zeros((len(guesses), shared))], axis=1)
@@ -405,7 +412,9 @@ def _collect_candidates(
             raise guesses
         else:
             candidates = kind.spread_frames()
-        offered.append(np.concatenate([candidates, kind.nominal_values[None]]))
+        if worth == np.inf:
+            candidates = np.concatenate([candidates, kind.nominal_values[None]])
+        offered.append(candidates)
     k = max(len(guesses) for guesses in offered)
     return np.stack([np.concatenate([g, np.repeat(g[-1:], k - len(g), axis=0)]) for g in offered])
 

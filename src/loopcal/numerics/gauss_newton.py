@@ -144,9 +144,9 @@ def minimize_from_starts(
     """Minimize sums of squares from starts x (c, u) at once, by damped Gauss-Newton; return the
     ends and the sums of squares (c,), infinite where a start cannot be evaluated.
 
-    A start ends where a step moves the residuals by a `negligible` share of their sigma, or of
-    themselves; and at once where its sum of squares is more than `worth` times the lowest one of
-    its `rivals`, the starts with the same number (c,).
+    A start ends after a step that moves the residuals by a `negligible` share of their sigma, or of
+    themselves, whose end is not evaluated; and at once where its sum of squares is more than
+    `worth` times the lowest one of its `rivals`, the starts with the same number (c,).
     """
     x = np.array(x)
     residual, jacobian = map(np.array, linearize(x, np.arange(len(x))))
@@ -160,11 +160,14 @@ def minimize_from_starts(
         if not active.size:
             break
         step, length = _damp_step(residual[active], jacobian[active], damping[active])
-        moved = x[active] + step
+        goes_on = length > negligible * (1.0 + np.sqrt(cost[active]))
+        x[active[~goes_on]] += step[~goes_on]
+        active, moved = active[goes_on], x[active[goes_on]] + step[goes_on]
+        if not active.size:
+            break
         new_residual, new_jacobian = linearize(moved, active)
         new_cost = sum_squares(new_residual)
-        is_small = length <= negligible * (1.0 + np.sqrt(new_cost))
-        goes_on = ~is_small & (damping[active] <= LARGEST_DAMPING)
+        goes_on = damping[active] <= LARGEST_DAMPING
         better = new_cost < cost[active]
         damping[active] *= np.where(better, 0.1, 10.0)
         taken = active[better]

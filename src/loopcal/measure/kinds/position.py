@@ -329,9 +329,11 @@ class Position(TargetKind):
         return geometry.solve_least_squares(rows, (base - origin).ravel())[None]
 
     def guess_sets(
-        self, T: FloatArray, measured: FloatArray, is_row: BoolArray
+        self, T: FloatArray, measured: FloatArray, is_row: BoolArray, worth: float = np.inf
     ) -> list[FloatArray | DataError]:
-        """Return the candidates of each set; frames with targets of all sets are found together."""
+        """Return the candidates of each set; frames with targets of all sets are found together,
+        see `geometry.solve_frame_and_points`.
+        """
         if self.is_of_base or not {"frame", "targets"} <= set(self.unknown):
             return super().guess_sets(T, measured, is_row)
         (s, r), k = measured.shape[:2], len(self.targets)
@@ -349,7 +351,7 @@ class Position(TargetKind):
             moving = own[:, :, None, :3, None, :3] * np.eye(k)[:, None, :, None]
             moving = moving.reshape(len(chosen), r * k, 3, 3 * k)
             origin = np.repeat(own[:, :, :3, 3], k, axis=1)
-            sets = positions[chosen], moving, origin
+            sets = positions[chosen], moving, origin, worth
             frames, places, of = geometry.solve_frame_and_points(*sets)
             items = {"frame": setup.encode_frame(self.T_base_frame, frames), "targets": places}
             ends = np.flatnonzero(np.diff(of)) + 1
