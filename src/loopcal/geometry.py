@@ -18,7 +18,6 @@ import numpy as np
 
 from loopcal import engine
 from loopcal.errors import DataError
-from loopcal.numerics.decomposition import are_nonzero
 from loopcal.numerics.elimination import eliminate_from_triangle
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension
@@ -588,9 +587,7 @@ OCTAHEDRAL_ROTATIONS.setflags(write=False)
 
 TINY = 1e-300  # divisor [1] in place of zero
 FLATNESS = 1e-6  # ratio of extents [1] below which points count as coplanar, or as collinear
-# Change of a rotation [rad] that ends `solve_directions` and `minimize_over_rotations`; a descent
-# refines the result anyway.
-ROTATION_CHANGE = 1e-6
+ROTATION_CHANGE = 1e-6  # change of a rotation [rad] that ends `minimize_over_rotations`
 MEETING = 0.03  # angle [rad] between two starts from which one of them stands for both
 
 NEWTON_STEPS, FLATTEST, ROUNDING = 40, 1e-9, 1e-15
@@ -813,10 +810,10 @@ def solve_resection(rays: FloatArray, points: FloatArray) -> FloatArray:
     middle = points.mean(axis=0)
     M = np.einsum("rij,rk->rijk", across, points - middle).reshape(-1, 9)
     C = across.reshape(-1, 3)
-    Q = _column_space(C)
-    out = M - Q @ (Q.T @ M)
+    of_M = solve_least_squares(C, M)
+    out = M - C @ of_M
     A = minimize_over_rotations((out.T @ out)[None], np.zeros((1, 9)), count=8)[0]
-    s = solve_least_squares(C, M @ A.reshape(-1, 9).T).T
+    s = A.reshape(-1, 9) @ of_M.T
     ahead = np.einsum("ri,kij,rj->kr", rays, A, points - middle) - np.einsum("ri,ki->kr", rays, s)
     order = np.argsort(-np.mean(ahead > 0.0, axis=1), kind="stable")
     R = np.swapaxes(A, -1, -2)
@@ -875,30 +872,14 @@ def solve_directions(
     """Return orientations R (k, 3, 3) and directions a (k, 3) with `R measured = rotations a`, the
     best first, for unit vectors (r, 3) in the frame of the instrument and rotations (r, 3, 3).
 
-    Each of R and a follows in closed form from the other one. The alternation begins at 24
-    orientations. A given `axis` (3,) is a, and leaves R alone, in one step.
+    The sum of `measured' R' rotations a` is largest: for given a, at a projection; for any a, where
+    the length of its factor by a, which is linear in R, is largest. A given `axis` (3,) is a.
     """
     if axis is not None:
         R = project_to_rotations(np.einsum("rij,j,rk->ik", rotations, axis, measured))
         return R[None], axis[None]
-    R = np.array(OCTAHEDRAL_ROTATIONS)
-    a = np.zeros((len(R), 3))
-    # both steps need the rows only through these 27 sums
-    sums = np.einsum("rji,rl->ijl", rotations, measured)
-    for _ in range(100):
-        a = np.einsum("ijl,kjl->ki", sums, R)
-        a /= np.maximum(np.linalg.norm(a, axis=-1, keepdims=True), 1e-300)
-        before, R = R, project_to_rotations(np.einsum("jil,kj->kil", sums, a))
-        if np.abs(R - before).max() < ROTATION_CHANGE:
-            break
-    error = np.linalg.norm(
-        np.einsum("kij,rj->kri", R, measured) - np.einsum("rij,kj->kri", rotations, a), axis=(1, 2)
-    )
-    order = np.argsort(error)
-    return R[order][:6], a[order][:6]
-
-
-def _column_space(C: FloatArray) -> FloatArray:
-    """Return an orthonormal basis of the columns of C."""
-    U, s, _ = np.linalg.svd(C, full_matrices=False)
-    return U[:, are_nonzero(s, ALIGNMENT_TOLERANCE)]
+    S = np.einsum("rji,rl->ijl", rotations, measured).reshape(3, 9)
+    form = np.linalg.norm(S) ** 2 * np.eye(9) - S.T @ S
+    R = minimize_over_rotations(form[None], np.zeros((1, 9)), 6)[0]
+    a = R.reshape(-1, 9) @ S.T
+    return R, a / np.maximum(np.linalg.norm(a, axis=1, keepdims=True), TINY)

@@ -145,17 +145,24 @@ def test_start_values_of_all_sessions_are_sought_together(name, monkeypatch):
 
 
 def test_a_frame_is_sought_with_a_few_of_many_targets(monkeypatch):
-    rng, widths, minimize = np.random.default_rng(1), [], initial_values.minimize_from_starts
+    rng, widths = np.random.default_rng(1), []
     names = tuple(f"t{i}" for i in range(20))
     kind = Position(targets=names, places=np.zeros((20, 3)), unknown=("frame", "targets"))
     T = poses(rng)
     data, local, _ = simulate_rows(kind, T, rng)
 
-    def record(*given):
-        widths.append(given[1].shape[1])
-        return minimize(*given)
+    def record(name):
+        compute = getattr(initial_values, name)
 
-    monkeypatch.setattr(initial_values, "minimize_from_starts", record)
+        def recorded(*given):
+            found = compute(*given)
+            widths.append(found[0].shape[-1])
+            return found
+
+        monkeypatch.setattr(initial_values, name, recorded)
+
+    record("_collect_candidates")
+    record("minimize_from_starts")
     found = guess_nuisance_values(data, T, local)
     assert widths == [6 + 3 * 8, 6 + 3 * 20]  # the last one from the best start, with all rows
     assert_allclose(whitened_residuals(data, T, local, found), 0.0, atol=1e-3)

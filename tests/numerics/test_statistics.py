@@ -10,7 +10,7 @@ import warnings
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy import integrate
 
 from loopcal.numerics.statistics import (
@@ -22,6 +22,7 @@ from loopcal.numerics.statistics import (
     compute_weighted_quantile,
     estimate_variance_component,
     find_distinct,
+    find_distinct_rows,
 )
 
 WEIGHTS = np.geomspace(5.0, 1e-3, 12)
@@ -176,3 +177,12 @@ def test_quantile_of_a_weighted_sum_of_squares_is_that_of_known_distributions(sh
 def test_quantile_of_no_weight_is_zero():
     assert compute_weighted_quantile(np.zeros(3), 0.9) == 0.0
     assert compute_weighted_quantile(np.zeros(0), 0.9) == 0.0
+
+
+def test_distinct_rows_are_those_of_numpy_even_where_their_sums_are_equal():
+    weights = np.uint64(0x9E3779B97F4A7C15) ** np.arange(1, 3, dtype=np.uint64)
+    equal = np.array([[weights[1], 0], [0, weights[0]]], dtype=np.uint64).astype(np.int64)
+    for rows in (np.random.default_rng(2).integers(-2, 3, (500, 4)), equal, equal[:0]):
+        distinct, member = find_distinct_rows(rows)
+        assert_array_equal(distinct, np.unique(rows, axis=0))
+        assert_array_equal(distinct[member], rows)

@@ -31,7 +31,7 @@ from loopcal.numerics.elimination import (
     eliminate_tree,
     use_path,
 )
-from loopcal.numerics.statistics import find_distinct
+from loopcal.numerics.statistics import find_distinct, find_distinct_rows
 from loopcal.numerics.trial_batch import TrialBatch
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
@@ -261,7 +261,7 @@ def _sets(rows: Sequence[ObservationRows], member: IntArray | None) -> IntArray:
     sets, count = [np.zeros((0, 2), dtype=np.int64)], 0
     using = [r for r in rows if r.nuisance.shape[1]]
     for r in using:
-        used = np.unique(r.nuisance, axis=0)
+        used, _ = find_distinct_rows(r.nuisance)
         number = np.repeat(count + np.arange(len(used)), used.shape[1])
         sets.append(np.column_stack([number, used.ravel()]))
         count += len(used)

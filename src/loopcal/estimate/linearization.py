@@ -302,7 +302,7 @@ def evaluate_rows(
     """
     measured, white = rows.take_trials(trials)
     T = poses.T
-    if not _is_every_pose(rows, T.shape[1]):
+    if _count_rows_of_poses(rows, T.shape[1]) != 1:
         T = T[:, rows.poses]
     T = np.broadcast_to(T, (len(trials), *T.shape[1:]))
     used = nuisance is not None and rows.nuisance.shape[1]
@@ -346,7 +346,7 @@ def linearize_rows(
     machine = np.empty((a, r, m, 1 + (poses.by_parameters.shape[-1] if by_parameters else 0)))
     machine[..., -1] = rows.whiten(white, residual, trials)
     if by_parameters:
-        _write_parameter_columns(rows, evaluated, white, poses, machine[..., :-1])
+        _write_parameter_columns(rows, evaluated, white, poses, machine)
     return KindRows(
         machine,
         by_nuisance=by_nuisance,
@@ -370,10 +370,10 @@ def _write_parameter_columns(
     evaluated: Evaluation,
     white: FloatArray,
     poses: LinearizedPoses,
-    out: FloatArray,
+    machine: FloatArray,
 ) -> None:
-    """Write whitened derivatives (a, r, m, p) of a kind by the scaled parameters."""
-    D = poses.by_parameters
+    """Write whitened derivatives of a kind by the p scaled parameters to rows (a, r, m, p + 1)."""
+    D, out = poses.by_parameters, machine[..., :-1]
     if rows.kind.poses_per_row > 1:
         linked = (
             evaluated.jacobian[:, :, i] @ D[:, rows.poses[:, i]]
@@ -381,10 +381,15 @@ def _write_parameter_columns(
         )
         np.matmul(white, sum(linked, start=np.zeros(1)), out=out)
         return
-    if not _is_every_pose(rows, D.shape[1]):
+    by_twist, product = rows.whiten_columns(white, evaluated.jacobian), out
+    if count := _count_rows_of_poses(rows, D.shape[1]):
+        n, height = D.shape[1], count * machine.shape[2]
+        by_twist = by_twist.reshape(len(by_twist), n, height, 6)
+        product = machine.reshape(len(machine), n, height, -1)[..., :-1]
+    else:
         D = D[:, rows.poses]
     # one order of the products for any number of trials: each trial equals its own fit bit for bit
-    np.matmul(rows.whiten_columns(white, evaluated.jacobian), D, out=out)
+    np.matmul(by_twist, D, out=product)
     for j, name in enumerate(rows.kind.sensed_joints):
         if name in poses.joints_by_parameters and evaluated.joints is not None:
             slope = poses.joints_by_parameters[name][:, rows.poses, None, :]
@@ -416,9 +421,12 @@ def _coordinate_columns(
     return np.matmul(white, columns)[:, :, None]
 
 
-def _is_every_pose(rows: ObservationRows, count: int) -> bool:
-    """Return whether row i observed pose i and there are no other poses."""
-    return np.array_equal(rows.poses, np.arange(count))
+def _count_rows_of_poses(rows: ObservationRows, count: int) -> int:
+    """Return the number of rows of each pose, where all poses have as many, one behind the other in
+    the order of the poses; else 0.
+    """
+    each = len(rows.poses) // max(count, 1)
+    return each * np.array_equal(rows.poses, np.arange(count).repeat(each))
 
 
 # Poses of a batch of trials: their states, and what solving for them gives.

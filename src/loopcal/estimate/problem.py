@@ -326,10 +326,18 @@ class Problem:
         for first in range(0, t, batch):
             chosen = np.arange(first, min(first + batch, t))
             z, trials, begin = deviation[chosen], self.trials[chosen], start.take(chosen)
-            solution = poses.solve(
-                z, trials, begin, self.control, known=known, derivatives=not folds
-            )
-            linearizations.append(self.take(chosen).linearize_at(z, begin, solution))
+            # start values that were sought here may be the best ones, as the elimination tells
+            is_here = t == 1 and not poses.coordinates.count and (z == begin.deviation).all()
+            fixed = begin.nuisance if self.nuisance is not None and is_here else None
+            given, more = (z, trials, begin, self.control), {"derivatives": not folds}
+            solution = poses.solve(*given, fixed, known, **more)
+            part = self.take(chosen).linearize_at(z, begin, solution)
+            if fixed is not None and part.nuisance is not None:
+                gain = part.nuisance.elimination.explained
+                if not self.control.is_negligible(gain, part.cost + gain).all():
+                    solution = poses.solve(*given, None, solution, **more)
+                    part = self.take(chosen).linearize_at(z, begin, solution)
+            linearizations.append(part)
         return Linearization.join(linearizations)
 
     def advance(

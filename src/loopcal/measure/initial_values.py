@@ -25,7 +25,7 @@ from loopcal.measure.nuisance import NuisanceParameters
 from loopcal.measure.observations import Observations, whiten_columns
 from loopcal.numerics.elimination import find_connected_groups
 from loopcal.numerics.gauss_newton import GOOD_START, STEPS, minimize_from_starts, sum_squares
-from loopcal.numerics.statistics import choose_evenly, find_distinct
+from loopcal.numerics.statistics import choose_evenly, find_distinct, find_distinct_rows
 from loopcal.parameters import ParameterTable
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
@@ -34,6 +34,8 @@ from loopcal.typing import BoolArray, FloatArray, IntArray
 ALIKE = 1.0
 # Ratio of sums of squares above which rounding and curvature cannot change which one is lower.
 AS_LOW = 4.0
+# Ratio of the largest and the smallest variance up to which noise is equal, apart from rounding.
+EQUAL_NOISE = 1.0 + 1e-9
 # Rows of a group, and values for each of its unknowns, from which start values are sought: more
 # would make them no better, since the geometry of the robot is not known yet.
 FEWEST_ROWS, VALUES = 60, 20.0
@@ -275,9 +277,9 @@ def _list_groups(
         if not rows.kind.nuisance_parameters or rows.kind.sensed_joints:
             continue
         counts = np.flatnonzero((rows.weight > 0.0) & rows.present.any(axis=1))
-        sets, member = np.unique(nuisance.indices[i][counts], axis=0, return_inverse=True)
-        order = np.argsort(member.ravel(), kind="stable")
-        ends = np.cumsum(np.bincount(member.ravel(), minlength=len(sets)))[:-1]
+        sets, member = find_distinct_rows(nuisance.indices[i][counts])
+        order = np.argsort(member, kind="stable")
+        ends = np.cumsum(np.bincount(member, minlength=len(sets)))[:-1]
         parts = np.split(counts[order], ends) if len(sets) else []
         # an even choice of enough rows will do, unless it lacks most values of a component
         unknowns = len(rows.kind.nuisance_parameters)
@@ -358,7 +360,9 @@ def _refine_candidates(
     if is_plain and isinstance(kind, Position) and {"frame", "targets"} <= set(kind.unknown):
         # minima for equal noise: each is left where another one is lower for any other noise, too
         size = np.abs(np.einsum("...mm->...m", whitener))
-        if np.count_nonzero(size) == np.count_nonzero(whitener):
+        seen = size.reshape(*size.shape[:-1], -1, 3) > 0.0
+        is_whole = (seen.any(axis=-1) == seen.all(axis=-1)).all()
+        if is_whole and np.count_nonzero(size) == np.count_nonzero(whitener):
             worth = AS_LOW * (size.max() / size.min(where=size > 0.0, initial=np.inf)) ** 2
     candidates = _collect_candidates(kind, poses, columns, is_row, is_strict, worth)
     k, own = candidates.shape[1], values.reshape(t * g, 1, -1)
@@ -380,9 +384,13 @@ def _refine_candidates(
         cost = sum_squares(whiten(candidates, sets)[0]).reshape(t * g, k)
         chosen = (np.argsort(cost, axis=1)[:, :most] + k * np.arange(t * g)[:, None]).ravel()
         candidates, sets, k = candidates[chosen], sets[chosen], most
-    refined, cost = minimize_from_starts(
-        lambda x, which: whiten(x, sets[which]), candidates, steps, GOOD_START, sets, worth
-    )
+    is_minimum = (candidates != kind.nominal_values).any(axis=1).all()
+    if k == 1 and worth <= AS_LOW * EQUAL_NOISE and is_minimum:
+        refined, cost = candidates, np.zeros(len(candidates))
+    else:
+        refined, cost = minimize_from_starts(
+            lambda x, which: whiten(x, sets[which]), candidates, steps, GOOD_START, sets, worth
+        )
     names = [parameter.name for parameter in kind.nuisance_parameters]
     shortest = shorten_rotations(names, refined)
     is_same = ((shortest == refined) | ~kept).all(axis=1, keepdims=True)

@@ -29,7 +29,7 @@ from loopcal.measure.readings import (
     weight_reading_sigma,
 )
 from loopcal.numerics.elimination import find_connected_groups
-from loopcal.numerics.statistics import find_distinct
+from loopcal.numerics.statistics import find_distinct, find_distinct_rows
 from loopcal.results.description import Field, label_axes
 from loopcal.results.result import TableResult
 from loopcal.typing import BoolArray, FloatArray, IntArray
@@ -456,7 +456,7 @@ def _count_values(data: Measurements) -> _SetupValues:
     keys, counts = [np.zeros(0, np.intp)], [np.zeros(0)]
     for o, used in zip(data.observations, nuisance.indices, strict=False):
         row, column = np.nonzero(is_open[used] & (o.weight > 0.0)[:, None])
-        pair = find_distinct(np.column_stack([row, owner_of[used[row, column]]]), axis=0)
+        pair = find_distinct_rows(np.column_stack([row, owner_of[used[row, column]]]))[0]
         keys.append(pair[:, 1] * n + o.rows.reshape(len(o), -1)[pair[:, 0], 0])
         counts.append(o.present.sum(axis=1)[pair[:, 0]])
     at, member = np.unique(np.concatenate(keys), return_inverse=True)

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from loopcal.numerics.elimination import find_connected_groups
-from loopcal.numerics.statistics import find_distinct
+from loopcal.numerics.statistics import find_distinct, find_distinct_rows
 from loopcal.typing import FloatArray, IntArray
 
 EXPLAINED = 1e-6  # share of its length below which a column counts as explained by other columns
@@ -193,7 +193,7 @@ def _decompose_groups(columns: Any, of_row: IntArray, group: IntArray) -> Any:
     inside, width = _number_within(group), np.bincount(group)
     entries, parts, total = columns.tocoo(), [], 0
     of_entry = group[entries.col]
-    for shape in find_distinct(np.column_stack([count, width]), axis=0).tolist():
+    for shape in find_distinct_rows(np.column_stack([count, width]))[0].tolist():
         alike = np.flatnonzero((count == shape[0]) & (width == shape[1]))
         number = np.full(len(count), -1)
         number[alike] = np.arange(len(alike))

@@ -352,14 +352,30 @@ def invert_increasing(
 # Distinct values and medians without masked arrays.
 
 
-def find_distinct(values: NDArray[Any], axis: int | None = None) -> NDArray[Any]:
-    """Return the distinct values of an array, of any shape and type, in ascending order; or its
-    distinct parts along an axis.
+def find_distinct(values: NDArray[Any]) -> NDArray[Any]:
+    """Return the distinct values of an array, of any shape and type, in ascending order.
 
     They are those of `np.unique`. With `return_counts`, it does not ask whether the array is masked
     (numpy 2.4).
     """
-    return np.unique(values, return_counts=True, axis=axis)[0]
+    return np.unique(values, return_counts=True)[0]
+
+
+def find_distinct_rows(rows: IntArray) -> tuple[IntArray, IntArray]:
+    """Return the distinct rows (k, c) of whole numbers (r, c) in ascending order, and which of them
+    each row is (r,).
+
+    Rows are sorted by a sum of their numbers with odd weights, modulo 2^64, and by NumPy, in ten
+    times the time, where rows with the same sum differ.
+    """
+    weights = np.uint64(0x9E3779B97F4A7C15) ** np.arange(1, rows.shape[1] + 1, dtype=np.uint64)
+    _, first, member = np.unique(
+        rows.astype(np.uint64) @ weights, return_index=True, return_inverse=True
+    )
+    if (rows[first][member] != rows).any():
+        first, member = np.arange(len(rows)), np.arange(len(rows))
+    distinct, order = np.unique(rows[first], axis=0, return_inverse=True)
+    return distinct, order.ravel()[member]
 
 
 def choose_evenly(count: int, most: int) -> IntArray:
