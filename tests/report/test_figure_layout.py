@@ -19,7 +19,7 @@ def _draw_everything(layout: ConstrainedLayoutEngine) -> Figure:
     figure = Figure(figsize=(9.0, 8.0), layout=layout)
     grid = figure.add_gridspec(3, 3, height_ratios=[2, 3, 2])
     by_pose = figure.add_subplot(grid[0, :])
-    (line,) = by_pose.plot(np.arange(1, 31), np.logspace(-4, 2, 30), label="a series of errors")
+    by_pose.plot(np.arange(1, 31), np.logspace(-4, 2, 30), label="a series of errors")
     by_pose.set_yscale("log")
     label_axes(by_pose, "", "error [mm]", "by pose")
     label_poses(by_pose, [f"corner-{i}" for i in range(30)])
@@ -37,7 +37,7 @@ def _draw_everything(layout: ConstrainedLayoutEngine) -> Figure:
     right = figure.add_subplot(grid[2, 1])
     right.yaxis.tick_right()
     right.plot([0, 1], [-12345.0, 6789.0])
-    add_legend(figure, [line])
+    add_legend(figure)
     return finish_figure(figure, "A title\nof two lines")
 
 

@@ -47,7 +47,7 @@ from loopcal.mechanism.assembly import AXES, TWIST_UNITS
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import POSITION, TILT, list_dimensions, read_coordinates
 from loopcal.mechanism.sensitivity import differentiate_pose
-from loopcal.mechanism.solutions import Solution, are_poses, forward, inverse, list_commanded
+from loopcal.mechanism.solutions import Solution, are_poses, forward, inverse
 from loopcal.mechanism.states import Status
 from loopcal.mechanism.workspace import (
     check_limits,
@@ -308,7 +308,7 @@ def compensate(
 
 def _follow(robot: Mechanism, controller: Mechanism, commanded: Solution) -> Solution:
     """Return where a robot is at the readings of its controller, at today's conditions."""
-    return forward(robot, commanded.q[:, list_commanded(controller)])
+    return forward(robot, commanded.q[:, controller.is_commanded])
 
 
 def _use_map(posterior: Posterior | None) -> tuple[Finding, Posterior]:
@@ -474,7 +474,7 @@ class _Machine(NamedTuple):
         """Return how far (n, c) from targets the robot stops at commands (n, c), or NaN."""
         led = inverse(self.controller, commands)
         readings = np.where(led.converged[:, None], led.q, np.nan)
-        return self.stop(targets, readings[:, list_commanded(self.controller)])
+        return self.stop(targets, readings[:, self.controller.is_commanded])
 
     def stop(self, targets: FloatArray, readings: FloatArray) -> FloatArray:
         """Return how far (n, c) the robot stops from targets at readings (n, a)."""
@@ -696,7 +696,7 @@ def _fit_readings(
     and what remains at these.
     """
     led, own = (inverse(robot, targets) for robot in (machine.controller, machine.robot))
-    usable, commanded = led.converged & own.converged, list_commanded(machine.robot)
+    usable, commanded = led.converged & own.converged, machine.robot.is_commanded
     q, change = led.q[usable][:, commanded], (own.q - led.q)[usable][:, commanded]
     targets, checked = targets[usable][:CHECKS], q[:CHECKS]
     names = [a.name for a in machine.robot.actuators if a.reference is None]

@@ -223,7 +223,8 @@ class TwistCoordinates(PoseCoordinates):
     def close_from(self, values: FloatArray, begin: PoseStates, follow: bool) -> PoseStates:
         """Solve the inverse kinematics of every limb."""
         del follow
-        return PoseStates(*solve_at_pose(self.free.robot, values, begin.state.T, begin.state))
+        robot = self.free.robot
+        return PoseStates(*solve_at_pose(robot, values, begin.state.T, begin.state, begin.q))
 
     def move(self, states: PoseStates, u: FloatArray) -> PoseStates:
         """Move the platform."""

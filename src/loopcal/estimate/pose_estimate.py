@@ -183,7 +183,7 @@ def predict_from_readings(robot: Mechanism, data: Measurements) -> tuple[Solutio
         if sigma is not None:
             known = np.asarray(np.isfinite(sigma).all(axis=1))
         return forward(robot, data.readings), known
-    ratio = sigma / np.array(robot.redundancy)
+    ratio = sigma[:, robot.is_commanded] / np.array(robot.redundancy)
     if np.isfinite(ratio).all() and np.ptp(ratio, axis=1).max() <= SAME_RATIO * ratio.min():
         solution = forward(robot, data.readings)
         if solution.converged.all():

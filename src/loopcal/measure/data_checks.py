@@ -112,8 +112,7 @@ def describe_outside_strokes(
 
     places : of poses, such as `data.csv:12`.
     """
-    commanded = [actuator.reference is None for actuator in robot.actuators]
-    beyond = find_outside_strokes(measurements.readings, robot) * np.array(commanded)
+    beyond = find_outside_strokes(measurements.readings, robot) * robot.is_commanded
     if not beyond.any():
         return None
     widths = np.array([np.ptp(actuator.stroke or (0.0, 1.0)) for actuator in robot.actuators])

@@ -196,11 +196,18 @@ def resolve_reading_sigma(robot: Mechanism, given: FloatArray | None, n: int) ->
             "instead"
         ),
     )
-    if robot.redundancy is not None and np.any(given == 0.0):
-        exact = robot.actuators[int(np.argwhere(given == 0.0)[0, 1])].name
+    wrong = (given == 0.0) == robot.is_commanded
+    if robot.redundancy is not None and wrong.any():
+        column = int(np.argwhere(wrong)[0, 1])
+        reading = robot.actuators[column].name
+        if not robot.is_commanded[column]:
+            raise DataError(
+                f"the data state a sigma of {reading}, but conditions of a robot with redundant "
+                "actuators count as exact. Leave out this sigma"
+            )
         raise DataError(
-            f"the data declare exact readings of {exact}, but {robot.name!r} has "
-            f"{len(robot.actuators)} actuators for {len(robot.freedoms)} degrees of freedom. "
+            f"the data declare exact readings of {reading}, but {robot.name!r} has "
+            f"{robot.is_commanded.sum()} actuators for {len(robot.freedoms)} degrees of freedom. "
             "Readings of redundant actuators cannot be exact. Give each a sigma above 0, a "
             "small one for very good encoders"
         )

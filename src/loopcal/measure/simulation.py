@@ -33,7 +33,7 @@ from loopcal.measure.readings import (
     select_joint_values,
     solve_commanded_poses,
 )
-from loopcal.mechanism.actuation import list_open_sums, solve_at_pose
+from loopcal.mechanism.actuation import keep_conditions, list_open_sums, solve_at_pose
 from loopcal.mechanism.assembly import FORCES
 from loopcal.mechanism.chains import each_stage, join_stage_states
 from loopcal.mechanism.kinematics import Loops, compute_readings, forward_trials, load_readings
@@ -121,10 +121,10 @@ def _close_redundant(
         return readings, state
     if robot.redundancy is None:
         exact, (e, _) = robot.exact, robot.slots(values)
-        sums = list_open_sums(robot, values, robot.determining_readings)
+        sums = list_open_sums(robot, values, robot.determining_readings, readings)
         own = sums.join(sums.read(driven_values(robot.program, state)))
         closed = Loops(exact, e, sums.weights).solve(own, state)
-        return compute_readings(exact, values, closed), closed
+        return keep_conditions(robot, compute_readings(exact, values, closed), readings), closed
     lost = state.status != Status.CONVERGED
 
     def select(placed: np.ndarray, reached: np.ndarray) -> np.ndarray:
@@ -132,7 +132,7 @@ def _close_redundant(
         return np.where(mask, placed, reached)
 
     begin = replace(state, T=select(start.T, state.T))
-    placed, closed = solve_at_pose(robot, values, begin.T, begin)
+    placed, closed = solve_at_pose(robot, values, begin.T, begin, readings)
     return np.where(np.isfinite(closed), closed, readings), map_arrays(select, placed, state)
 
 

@@ -32,6 +32,7 @@ from loopcal.mechanism.transmission import (
     readings_from_joints,
     select_weights,
     term_derivatives,
+    transmit_readings,
 )
 from loopcal.numerics.trial_batch import map_arrays
 from loopcal.typing import FloatArray, IntArray
@@ -95,10 +96,13 @@ class OpenSums:
 
 
 def list_open_sums(
-    robot: Mechanism, values: FloatArray, places: IntArray | None = None
+    robot: Mechanism,
+    values: FloatArray,
+    places: IntArray | None = None,
+    q: FloatArray | None = None,
 ) -> OpenSums:
-    """Return the sums for values (t | 1, p), conditions at their references; places : of the
-    readings that choose sums, default all.
+    """Return the sums for values (t | 1, p); places : of the readings that choose sums, default
+    all. q : readings (t | 1, n, a) of conditions, which have their references without them.
     """
     (_, tau), constants = robot.slots(values), robot.slots.constants
     count, weights = int((~find_fixed_rows(constants)).sum()), select_weights(tau, constants)
@@ -106,7 +110,13 @@ def list_open_sums(
         weights = np.eye(robot.program.n_joints)[None]
     chosen = np.arange(count) if places is None else places
     own = weights[:, [*chosen, *range(count, weights.shape[1])]]
-    return OpenSums(chosen, evaluate_references(tau, constants)[..., count:], own)
+    at = evaluate_references(tau, constants) if q is None else transmit_readings(q, tau, constants)
+    return OpenSums(chosen, at[..., count:], own)
+
+
+def keep_conditions(robot: Mechanism, q: FloatArray, given: FloatArray) -> FloatArray:
+    """Return readings (t, n, a) with the conditions of given ones (t | 1, n, a)."""
+    return np.where(robot.is_commanded, q, given[..., : q.shape[-1]])
 
 
 # Redundant actuation with a prescribed pose: all other joints follow.
@@ -125,21 +135,23 @@ class PoseDrivenSensitivity(NamedTuple):
 
 
 def solve_at_pose(
-    robot: Mechanism, values: FloatArray, T: FloatArray, begin: State
+    robot: Mechanism, values: FloatArray, T: FloatArray, begin: State, q: FloatArray | None = None
 ) -> tuple[State, FloatArray]:
     """Close every limb with the platform at T (t, n, 4, 4); return states and readings (t, n, a).
 
-    begin : (t, n), whose joints select the branch of each limb.
+    begin : (t, n), whose joints select the branch of each limb. q : (t | 1, n, a) readings, of
+    which only the conditions count; these have their references without them.
     """
     (e, tau), sums = robot.slots(values), None
     guess, limbs = driven_values(robot.program, begin), robot.program.with_fixed_platform
     if robot.assembly.couplings:
-        own = list_open_sums(robot, values)
+        own = list_open_sums(robot, values, q=q)
         sums = scale_sums(robot, own.weights[:, own.chosen :], own.fixed)
     begin = replace(begin, T=T)
     state = engine.solve(limbs, e, guess, begin, free=sums is None, sums=sums)
     joints = driven_values(robot.program, state)
-    return state, readings_from_joints(joints, tau, robot.slots.constants)
+    closed = readings_from_joints(joints, tau, robot.slots.constants)
+    return state, closed if q is None else keep_conditions(robot, closed, q)
 
 
 def differentiate_at_pose(
@@ -164,10 +176,12 @@ def differentiate_at_pose(
         unknown[rows][:, :, m:] = -np.matmul(invert_weights(both[..., m:]), right)
     twists, joints = unknown[:, :, :M], unknown[:, :, M:]
     passive = move_passive_joints(robot, values, state, twists, joints)
-    readings = np.matmul(weights[:, :, :a], joints)
-    readings[..., :p] -= moved.parameters[:, :, :a]
+    readings = np.zeros((*state.T.shape[:2], len(robot.actuators), p + m))
+    own = np.matmul(weights[:, :, :a], joints)
+    own[..., :p] -= moved.parameters[:, :, :a]
     with np.errstate(all="ignore"):
-        readings /= np.einsum("...jj->...j", moved.readings[:, :, :a])[..., None]
+        slopes = moved.readings[:, :, :a, robot.is_commanded]
+        readings[:, :, robot.is_commanded] = own / np.einsum("...jj->...j", slopes)[..., None]
     names, nodes = [*name_passive_joints(robot)], np.zeros((*twists.shape[:2], 6, p + m))
     for node, (body, T) in enumerate(zip(robot.assembly.bodies, state.others, strict=True), 1):
         columns = [(i, f) for i, (own, f) in enumerate(program.unknown_twists) if own == node]

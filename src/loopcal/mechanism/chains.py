@@ -153,7 +153,7 @@ def list_carrying_stages(robot: Mechanism, end: int = -1) -> list[int]:
 
 def find_carrying_actuators(robot: Mechanism) -> IntArray:
     """Return the places of the independent actuators that move the end platform, unless held."""
-    places = np.flatnonzero([a.reference is None for a in robot.actuators])
+    places = np.flatnonzero(robot.is_commanded)
     names, carrying = [actuator.name for actuator in robot.actuators], list[int]()
     for stage in (robot.blocks[i] for i in list_carrying_stages(robot)):
         own, chosen = np.arange(len(names))[stage.actuators], stage.robot.independent

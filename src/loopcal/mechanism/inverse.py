@@ -492,13 +492,13 @@ def measure_spans(robot: Mechanism, turns: BoolArray) -> FloatArray:
         _, tau = robot.slots(robot.values[None])
         at_rest = ((np.nan if a.reference is None else a.reference,) * 2 for a in robot.actuators)
         strokes = np.array([a.stroke or e for a, e in zip(robot.actuators, at_rest, strict=True)])
-        commanded = [a.reference is None for a in robot.actuators]
-        has_all = sum(commanded) == robot.program.n_joints  # else readings are open sums
+        # else readings are open sums
+        has_all = robot.is_commanded.sum() == robot.program.n_joints
         convert = joints_from_readings if has_all else transmit_readings
         constants = robot.slots.constants
         ends = convert(strokes.T[None], tau, constants)[0][:, ~find_fixed_rows(constants)]
         stated = np.full(len(turns), np.nan)
-        stated[commanded] = np.abs(ends[1] - ends[0])
+        stated[robot.is_commanded] = np.abs(ends[1] - ends[0])
         spans = np.where(stated > 0.0, stated, spans)
     return spans
 

@@ -360,6 +360,11 @@ class Mechanism(DrawnResult):
         return describe_gap(gap, self.gap_scale)
 
     @property
+    def is_commanded(self) -> BoolArray:
+        """Which readings (a,) are commanded, not measured as those of conditions."""
+        return np.array([actuator.reference is None for actuator in self.actuators], dtype=bool)
+
+    @property
     def stated_sigma(self) -> FloatArray:
         """Standard deviations (a,) of the readings [SI]; 0 where the robot states none."""
         return np.array([actuator.sigma or 0.0 for actuator in self.actuators])

@@ -406,11 +406,6 @@ class Solution(TableResult):
         )
 
 
-def list_commanded(robot: Mechanism) -> BoolArray:
-    """Return which readings (a,) are commanded, which those of conditions are not."""
-    return np.array([actuator.reference is None for actuator in robot.actuators], dtype=bool)
-
-
 def forward(robot: Mechanism, q: ArrayLike, start: Solution | None = None) -> Solution:
     """Solve forward kinematics by Newton's method on the loop closure, beginning at `start`.
 
@@ -430,7 +425,7 @@ def forward(robot: Mechanism, q: ArrayLike, start: Solution | None = None) -> So
     a = len(robot.actuators)
     readings = np.atleast_2d(np.asarray(q, dtype=float))
     is_short = readings.ndim == 2 and readings.shape[1] < a
-    if is_short and readings.shape[1] == (commanded := list_commanded(robot)).sum():
+    if is_short and readings.shape[1] == (commanded := robot.is_commanded).sum():
         known, references = readings, [actuator.reference or 0.0 for actuator in robot.actuators]
         readings = np.tile(references, (len(known), 1))
         readings[:, commanded] = known

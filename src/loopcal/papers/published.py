@@ -530,13 +530,12 @@ def draw(figure: Figure, styles: Mapping[str, Mapping[str, Any]]) -> Canvas:
 
     canvas = style.start_figure(7.2, 4.6)
     axes = canvas.add_subplot()
-    handles = []
     for series in sorted(figure.series, key=lambda series: not series.label.startswith("_")):
         if series.label.startswith("_"):
             axes.plot(series.x, series.y, color=style.PALE, lw=style.THIN)
             continue
         is_line = figure.joined and series.joined
-        handles += axes.plot(
+        axes.plot(
             series.x, series.y, label=series.label, ms=style.DOT, lw=style.LINE * is_line,
             markevery=APART if is_line else None,
             fillstyle="full" if figure.joined else "none",  # points on points stay visible
@@ -545,11 +544,11 @@ def draw(figure: Figure, styles: Mapping[str, Mapping[str, Any]]) -> Canvas:
     for i, (label, value) in enumerate(figure.levels.items()):
         own = (styles[s.label]["color"] for s in figure.series if s.label in label)
         color, dashes = next(own, style.REFERENCE), ("--", ":", "-.")[i % 3]
-        handles.append(axes.axhline(value, color=color, ls=dashes, lw=style.LINE, label=label))
+        axes.axhline(value, color=color, ls=dashes, lw=style.LINE, label=label)
     axes.set_xscale("log" if "x" in figure.log else "linear")
     axes.set_yscale("log" if "y" in figure.log else "linear")
     if "x" not in figure.log and all(x.is_integer() for s in figure.series for x in s.x):
         style.label_sparsely(axes.xaxis)
     style.label_axes(axes, figure.x_label, figure.y_label)
-    style.add_legend(canvas, handles)
+    style.add_legend(canvas)
     return style.finish_figure(canvas, figure.title)

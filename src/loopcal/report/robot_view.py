@@ -46,7 +46,7 @@ def view_robot(inspection: RobotInspection) -> list[Block]:
     """Return the page of a robot."""
     robot = inspection.robot
     n, free = len(robot.parameters), int(robot.parameters.free.sum())
-    commanded = sum(actuator.reference is None for actuator in robot.actuators)
+    commanded = int(robot.is_commanded.sum())
     actuators, parameters = name_count(commanded, "actuator"), name_count(n, "parameter")
     loads, load, length = [], robot.assembly.load, robot.get_unit(Dimension.LENGTH)
     if robot.is_elastic:

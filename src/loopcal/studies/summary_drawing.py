@@ -14,12 +14,12 @@ from loopcal.checks import check_choice
 from loopcal.errors import DataError
 from loopcal.report.figures.style import (
     COLORS,
+    DARK,
+    DASHED,
     GRID,
     LABEL,
     LINE,
-    REFERENCE,
     SMALL,
-    THIN,
     add_legend,
     finish_figure,
     scale_logarithmically,
@@ -148,8 +148,6 @@ def draw_score(
 
     Raises DataError: an unknown score or factor, or more than `MOST_PANELS` panels.
     """
-    from matplotlib.lines import Line2D
-
     (place,) = find_columns(study, [score])
     layout = choose_layout(study, factor)
     groups = layout.group(summary.cells)
@@ -167,8 +165,8 @@ def draw_score(
     kinds = [kind for kind in STYLES if found[kind]]
     ends = [interval.value for kind in kinds for _, interval in found[kind]]
     unit = choose_unit(UNITS[column.unit], [np.median(ends)] if ends else [])
-    lines = [limit / unit.factor_to_si for limit in limits]
-    lines += [COVERAGE] if "mean" in kinds else []
+    lines = {limit / unit.factor_to_si: "limit of the question" for limit in limits}
+    lines |= {COVERAGE: ""} if "mean" in kinds else {}
 
     columns = min(len(groups), 3)
     rows = -(-len(groups) // columns)
@@ -184,8 +182,8 @@ def draw_score(
                 _draw_points(
                     axes, layout, _list_values(chosen, score, kind), shift, unit, kind, color
                 )
-        for y in lines:
-            axes.axhline(y, color=REFERENCE, lw=THIN, ls="--", zorder=1)
+        for y, label in lines.items():
+            axes.axhline(y, **DASHED, label=label, zorder=1)
     for axes in axes_grid.flat[len(groups) :]:
         axes.set_visible(False)
     if ends and min(ends) > 0.0 and max(ends) > WIDE * min(ends) and "mean" not in kinds:
@@ -194,18 +192,11 @@ def draw_score(
     for axes in axes_grid[:, 0]:
         axes.set_ylabel(f"{score.replace('_', ' ')} [{unit.symbol}]", fontsize=LABEL)
         axes.tick_params(axis="y", labelsize=SMALL)
-    handles = [
-        Line2D([], [], color=color, lw=2.0, label=f"{layout.color} {level}".strip())
-        for level, color in (colors.items() if layout.color is not None else ())
-    ]
+    for level, color in colors.items() if layout.color is not None else ():
+        axes_grid[0, 0].plot([], [], color=color, lw=2.0, label=f"{layout.color} {level}".strip())
     for style, words in (STYLES[kind] for kind in kinds):
-        handles.append(
-            Line2D([], [], color="0.3", marker=style[0], ls=style[1:], ms=4.0, label=words)
-        )
-    if limits:
-        words = "limit of the question"
-        handles.append(Line2D([], [], color=REFERENCE, ls="--", lw=THIN, label=words))
-    add_legend(figure, handles, 3 if columns == 1 else 5)
+        axes_grid[0, 0].plot([], [], style, color=DARK, ms=4.0, label=words)
+    add_legend(figure, 3 if columns == 1 else 5)
     return finish_figure(figure, "\n".join(_list_titles(study, summary, column, 70 * columns)))
 
 

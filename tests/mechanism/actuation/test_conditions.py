@@ -8,7 +8,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from loopcal.apply.compensation import compensate
-from loopcal.errors import FileError, MechanismError
+from loopcal.errors import DataError, FileError, MechanismError
 from loopcal.estimate.identification import identify
 from loopcal.estimate.penalties import MAP
 from loopcal.estimate.result import Identification
@@ -17,6 +17,7 @@ from loopcal.io.robot.robot_file import load_robot, save_robot
 from loopcal.measure.instrument import Gaussian, Instrument, Sensor
 from loopcal.measure.kinds.poses import Pose
 from loopcal.measure.simulation import sample_truth, simulate
+from loopcal.mechanism.actuation import differentiate_at_pose, solve_at_pose
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.solutions import forward, inverse
 from loopcal.mechanism.workspace import sample_workspace
@@ -124,6 +125,72 @@ def test_slopes_of_simulated_machines_are_as_accurate_as_stated() -> None:
         scores.append(deviation / fit.standard_deviations)
     # 480 values of a standard normal distribution
     assert 0.9 < np.sqrt(np.mean(np.square(scores))) < 1.1
+
+
+# Four cranks with rods hold a plate that needs three, and all cranks grow.
+LEGS = """format: 1
+family: limbs
+name: legs
+units: {length: mm, angle: deg}
+freedoms: [x, y, rz]
+controlled: [x, y, yaw]
+drives: {q: {reads: angle, sigma: 0.002, unknown: [offset], angle: {sd: 0.2}}}
+conditions: {temperature: {reference: 20, range: [15, 45]}}
+couplings:
+  grow: {of: length, sum: {leg.stretch: 1}, condition: temperature, slope: 0.0046, unknown: [slope], slopes: {sd: 0.0007}}
+limbs:
+  - name: leg
+    copies: {count: 4}
+    chain:
+      - {joint: R, name: motor, at: {x: 320, yaw: 130}, actuated: q}
+      - {joint: P, name: stretch, at: [200, 0, 0], axis: x}
+    ending: distance
+    length: 190
+    attach: [70, 10, 0]
+    errors: [{of: stretch, shift: [x], tolerance: {sd: 0.1}}, {of: rod, shift: [length], tolerance: {sd: 0.1}}]
+workspace: {x: [-30, 30], y: [-30, 30], yaw: [-15, 15]}
+"""  # noqa: E501
+
+
+def test_a_leg_more_than_needed_grows_with_its_temperature(tmp_path: Path) -> None:
+    robot = load_text(tmp_path, LEGS)
+    machine = robot.with_values(sample_truth(robot, 1, 6)[0])
+    value = dict(zip(robot.parameters.names, machine.values, strict=True))
+    sharp = np.array([1e-9, 1e-9, 1e-9, 1e-9, 0.0])  # [rad], and the temperature
+    poses = sample_workspace(robot, 20, seed=2).coordinates
+    data = simulate(machine, poses, INSTRUMENT, 3, reading_sigma=sharp)
+    warm = data.readings[:, 4]
+    assert np.ptp(warm) > 20.0  # [K], as drawn from the range
+    T = forward(machine, data.readings).T
+    turn = T[:, 0, 0] + 1j * T[:, 1, 0]
+    for i in range(4):
+        angle = np.pi / 2 * i + np.deg2rad(130) + data.readings[:, i] + value[f"q{i + 1}.offset"]
+        crank = value[f"leg{i + 1}.stretch.x"] + value[f"grow{i + 1}.slope"] * (warm - 20.0)
+        elbow = 0.32 * 1j**i + crank * np.exp(1j * angle)
+        tip = T[:, 0, 3] + 1j * T[:, 1, 3] + turn * (0.07 + 0.01j) * 1j**i
+        assert_allclose(abs(tip - elbow), value[f"leg{i + 1}.length"], rtol=0, atol=2e-9)
+    state, q = solve_at_pose(
+        *(machine, machine.values[None], T[None], robot.home_state), data.readings[None]
+    )
+    moved = differentiate_at_pose(machine, machine.values[None], q, state)
+    for k, change in enumerate(1e-6 * np.eye(len(robot.parameters))):
+        ends = [
+            solve_at_pose(machine, machine.values[None] + side * change, T[None], state, q)[1]
+            for side in (1, -1)
+        ]
+        slope = (ends[0] - ends[1]) / 2e-6
+        assert_allclose(moved.readings[0][..., k], slope, rtol=0, atol=1e-5)  # step 1e-6
+
+
+def test_estimates_of_warm_redundant_legs_are_as_accurate_as_stated(tmp_path: Path) -> None:
+    robot, scores = load_text(tmp_path, LEGS), []
+    for seed in range(20):
+        machine, fit = fit_machine(robot, seed)
+        scores.append((fit.robot.values - machine.values) / fit.standard_deviations)
+    # 320 values, in part correlated
+    assert 0.9 < np.sqrt(np.mean(np.square(scores))) < 1.1
+    with pytest.raises(DataError, match="a sigma of temperature, but conditions"):
+        simulate(robot, robot.home[None], INSTRUMENT, 1, reading_sigma=1e-3)
 
 
 def test_compensation_holds_todays_temperatures() -> None:

@@ -20,7 +20,7 @@ from loopcal.measure.kinds.poses import Pose
 from loopcal.measure.simulation import sample_truth, simulate
 from loopcal.mechanism.assembly import FORCES
 from loopcal.mechanism.model import Mechanism
-from loopcal.mechanism.solutions import forward, inverse, list_commanded
+from loopcal.mechanism.solutions import forward, inverse
 from loopcal.mechanism.workspace import sample_workspace
 from tests.mechanism.derivatives import check_pose_derivatives
 from tests.robot_texts import load_text
@@ -121,7 +121,7 @@ def test_a_load_is_the_work_of_the_wrench_where_its_drive_moves_alone(tmp_path, 
     robot = make_elastic(tmp_path, name)
     wrench = np.array([30.0, -20.0, -100.0, 2.0, 1.0, -3.0])
     today = robot.with_conditions(dict(zip(FORCES, wrench, strict=True)))
-    solved = forward(today, sample_workspace(robot, 5, seed=1).solution.q[:, list_commanded(robot)])
+    solved = forward(today, sample_workspace(robot, 5, seed=1).solution.q[:, robot.is_commanded])
     assert solved.converged.all()
     names = [a.name for a in robot.actuators]
     elastic = [name.removeprefix("load.") for name in names if name.startswith("load.")]
@@ -167,7 +167,7 @@ def test_derivatives_by_compliances_and_loads_agree_with_differences(tmp_path, n
     robot = make_elastic(tmp_path, name) if name in DRIVES else load_cached_robot(NAME)
     machine = robot.with_values(sample_truth(robot, 1, 2)[0])
     q = sample_workspace(robot, 2, seed=4).solution.q
-    q[:, ~list_commanded(robot)] = 40.0
+    q[:, ~robot.is_commanded] = 40.0
     check_pose_derivatives(machine, q[None])
 
 

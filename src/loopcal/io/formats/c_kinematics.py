@@ -134,7 +134,7 @@ def write(source: ExportSource, into: Path | None) -> Exported:
 
 def fill_template(robot: Mechanism, parameters: Sequence[int]) -> str:
     """Return the C file of a robot, in which some parameters, by their places, can change."""
-    commanded = np.array([a.reference is None for a in robot.actuators])
+    commanded = robot.is_commanded
     head, body = _write_tables(robot, commanded, parameters)
     text = files("loopcal.io.formats").joinpath("kinematics.c").read_text("utf-8")
     for mark, part in (("HEAD", head), ("TABLES", body), ("TESTS", _write_tests(robot, commanded))):

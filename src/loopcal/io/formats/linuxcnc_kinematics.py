@@ -116,7 +116,7 @@ def _name_variable(pin: str) -> str:
 def _list_settings(robot: Mechanism, units: Mapping[Dimension, Unit]) -> list[str]:
     """Return the lines of the INI file that the machine needs."""
     home = compute_readings(robot, robot.values[None], robot.home_state)[0, 0]
-    commanded = [a.reference is None for a in robot.actuators]
+    commanded = robot.is_commanded
     lines = ["    [KINS]", f"    KINEMATICS = {NAME}", f"    JOINTS = {sum(commanded)}"]
     for i, (actuator, reading) in enumerate(
         (a, r) for a, r, use in zip(robot.actuators, home, commanded, strict=True) if use

@@ -38,7 +38,6 @@ from loopcal.report.figures.style import (
     label_poses,
     label_rows,
     label_sparsely,
-    make_handle,
     scale_logarithmically,
     shorten,
     start_figure,
@@ -172,9 +171,7 @@ def draw_residual_rows(
             _plot(axes, s.quantities[name] / factor, s.whitened, styles[s.label])
         _add_band(axes)
         label_axes(axes, f"{name} [{symbol}]", SIGMAS)
-    limits = make_handle("95 % limits of the stated noise", **DASHED)
-    handles = [make_handle(label, **style) for label, style in styles.items()]
-    add_legend(figure, [*handles, limits] if series else handles)
+    add_legend(figure)
     count = f"{sum(len(s.raw) for s in series)} residuals of {name_count(len(poses), 'pose')}"
     owners = tuple(dict.fromkeys(owner_of(name) for name in setup))
     fitted = f"after the best fit of {list_names(owners, 4)}" if owners else "in the stated frames"
@@ -182,9 +179,10 @@ def draw_residual_rows(
 
 
 def _choose_styles(series: Sequence[ResidualSeries]) -> Styles:
-    """Return color and marker of each series; they differ in both up to eight series."""
+    """Return label, color and marker of each series; they differ in both up to eight series."""
     return {
         label: {
+            "label": label,
             "color": COLORS[i % len(COLORS)],
             "marker": MARKERS[i % len(MARKERS)],
             "ls": "none",
@@ -258,7 +256,7 @@ def _add_band(axes: Axes) -> None:
     """Draw zero, and the limits of 95 % of the residuals if the stated noise is right."""
     axes.axhline(0.0, **ZERO, zorder=1)
     for sign in (-1.0, 1.0):
-        axes.axhline(sign * BAND, **DASHED, zorder=1)
+        axes.axhline(sign * BAND, **DASHED, zorder=1, label="95 % limits of the stated noise")
 
 
 # Length of an arrow of the rms of the residuals, as a share of the width of a picture.
@@ -320,15 +318,7 @@ def draw_parameter_rows(
         shown = [rows[k] for k in chunk]
         _draw_shifts(panels[0, 2 * i], shown, half[chunk])
         _draw_uncertainties(panels[0, 2 * i + 1], shown, half[chunk], converged)
-    handles = [
-        make_handle("shift, 95 % interval", color=SHIFT, marker="o", ms=DOT, lw=1.2),
-        make_handle("uncertainty (95 %)", color=WIDTH, marker="s", ms=DOT, ls="none"),
-        make_handle("one prior sd", color=PALE, lw=6, alpha=0.5),
-    ]
-    if not np.isfinite(half).all():
-        cross: dict[str, Any] = {"color": SHIFT, "marker": "x", "ms": DOT + 1, "ls": "none"}
-        handles.append(make_handle("without an interval", **cross))
-    add_legend(figure, handles)
+    add_legend(figure)
     status = "" if converged else ", without convergence: last values, not estimates"
     n_assumed = sum(row["tolerance_assumed"] for row in rows)
     assumed = f", {n_assumed} prior sd assumed" if n_assumed else ""
@@ -339,11 +329,16 @@ def _draw_shifts(axes: Axes, rows: Sequence[Mapping[str, Any]], half: FloatArray
     """Draw estimate minus nominal value in spreads, with the 95 % interval."""
     shift = np.array([(row["estimate"] - row["nominal"]) / row["tolerance"] for row in rows])
     known, y = np.isfinite(half), np.arange(len(rows))
-    axes.axvspan(-1.0, 1.0, color=PALE, alpha=0.35, lw=0.0, zorder=0)
+    band: dict[str, Any] = {"color": PALE, "alpha": 0.35, "lw": 0.0, "zorder": 0}
+    axes.axvspan(-1.0, 1.0, label="one prior sd", **band)
     axes.axvline(0.0, **ZERO, zorder=1)
-    style: dict[str, Any] = {"fmt": "o", "ms": DOT, "elinewidth": 1.2, "capsize": 1.5}
-    axes.errorbar(shift[known], y[known], xerr=half[known], color=SHIFT, **style)
-    axes.plot(shift[~known], y[~known], "x", color=SHIFT, ms=DOT + 1)
+    if known.any():
+        style: dict[str, Any] = {"fmt": "o", "ms": DOT, "elinewidth": 1.2, "capsize": 1.5}
+        style |= {"color": SHIFT, "label": "shift, 95 % interval"}
+        axes.errorbar(shift[known], y[known], xerr=half[known], **style)
+    if not known.all():
+        style = {"color": SHIFT, "ms": DOT + 1, "label": "without an interval"}
+        axes.plot(shift[~known], y[~known], "x", **style)
     label_rows(axes, [shorten(row["name"]) for row in rows])
     label_axes(axes, "estimate - nominal [prior sd]", "", "shift")
 
@@ -354,8 +349,8 @@ def _draw_uncertainties(
     """Draw the half-width of the 95 % interval in spreads; the numbers are at the right."""
     y, drawn = np.arange(len(rows)), np.isfinite(half) & (half > 0.0)
     axes.axvline(1.0, **DASHED, zorder=1)
-    axes.plot(half[drawn], y[drawn], "s", color=WIDTH, ms=DOT)
     if drawn.any():
+        axes.plot(half[drawn], y[drawn], "s", color=WIDTH, ms=DOT, label="uncertainty (95 %)")
         axes.set_xlim(0.6 * min(half[drawn].min(), 1.0), 1.7 * max(half[drawn].max(), 1.0))
         scale_logarithmically(axes.xaxis, FEW_TICKS)
     else:
@@ -482,7 +477,7 @@ def draw_identifiability(analysis: Identifiability) -> Figure:
     _draw_spectrum(panels[0], analysis)
     if combinations:
         _draw_combinations(figure, panels[1], analysis, combinations, names)
-    add_legend(figure, figure.axes[0].get_legend_handles_labels()[0])
+    add_legend(figure)
     robot = analysis.free_parameters.robot.name
     rank = f"rank {analysis.rank} of {analysis.n_parameters}"
     return finish_figure(figure, f"{robot}: {rank}, {analysis.n_equations} equations")

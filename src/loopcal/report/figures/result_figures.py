@@ -55,8 +55,6 @@ from loopcal.report.figures.style import (
     label_poses,
     label_rows,
     label_sparsely,
-    make_handle,
-    make_patch,
     scale_logarithmically,
     shorten,
     start_figure,
@@ -139,23 +137,19 @@ def draw_budget_sources(budget: Mapping[str, Any]) -> Figure:
         unit = choose_unit(DISPLAY_UNITS[LENGTHS[kind]], [budget[kind]["rms"]], FINE)
         rms_by_source = np.sqrt([line[kind] for line in lines]) / unit.factor_to_si
         total = budget[kind]["rms"] / unit.factor_to_si
-        axes.barh(np.arange(len(lines)), rms_by_source, height=0.6, color=COLORS[5])
-        axes.axvline(total, color=DARK, lw=LINE)
+        how = {"color": COLORS[5], "label": "part of the source (squares add up)"}
+        axes.barh(np.arange(len(lines)), rms_by_source, height=0.6, **how)
+        axes.axvline(total, color=DARK, lw=LINE, label="all sources")
         for i, line in enumerate(lines):
             if line["halved"] is not None:
                 left = line["halved"][f"{kind}_rms"] / unit.factor_to_si
-                axes.plot([left], [i], "D", color=COLORS[1], ms=DOT + 1.0)
+                how = {"color": COLORS[1], "label": "all, with half its sigma"}
+                axes.plot([left], [i], "D", ms=DOT + 1.0, **how)
         axes.set_xlim(0.0, 1.08 * max(total, rms_by_source.max(initial=0.0)))
         title = f"{kind}: {format_number(total, 3)} {unit.symbol} in all"
         label_axes(axes, f"{kind} [{unit.symbol}]", "", title)
     label_rows(panels[0], [shorten(line["words"], 34) for line in lines])
-    halved = {"color": COLORS[1], "marker": "D", "ms": DOT, "ls": "none"}
-    handles = [
-        make_patch("part of the source (squares add up)", COLORS[5]),
-        make_handle("all sources", color=DARK, lw=LINE),
-        make_handle("all, with half its sigma", **halved),
-    ]
-    add_legend(figure, handles)
+    add_legend(figure)
     over = "poses of the workspace" if budget["over"] == "workspace" else "measured poses"
     return finish_figure(figure, f"Expected error (rms, k = 1) at {budget['poses']} {over}")
 
@@ -196,15 +190,7 @@ def draw_accuracy_map(accuracy: AccuracyMap) -> Figure:
             values = getattr(accuracy.uncertainty, name) / unit.factor_to_si
             points = _draw_row(panels, accuracy, measured, order[:2], slices, values)
             add_colorbar(figure, points, list(panels), label, aspect=22, pad=0.02)
-    handles = [make_handle("measured pose", marker="x", color=DARK, ms=4.5, ls="none")]
-    if accuracy.extrapolated.any():
-        ring: dict[str, Any] = {"marker": "o", "mfc": "none", "mec": COLORS[1], "ls": "none"}
-        handles.append(make_handle("less certain than every measured pose", **ring))
-    values = accuracy.uncertainty
-    if not (np.isfinite(values.position) & np.isfinite(values.orientation)).all():
-        square: dict[str, Any] = {"marker": "s", "color": REFERENCE, "ms": 4.0, "ls": "none"}
-        handles.append(make_handle("not bounded by the data, or out of reach", **square))
-    add_legend(figure, handles)
+    add_legend(figure)
     outside = f"{int(accuracy.extrapolated.sum())} of {name_count(n, 'pose')} extrapolated"
     return finish_figure(figure, f"{outside}\n{accuracy.uncertainty.frame}")
 
@@ -249,9 +235,15 @@ def _draw_row(
         bounded, unbounded = chosen & np.isfinite(values), chosen & ~np.isfinite(values)
         beyond = bounded & accuracy.extrapolated
         points = axes.scatter(x[bounded], y[bounded], c=values[bounded], s=20.0, **colors)
-        axes.scatter(x[beyond], y[beyond], s=52.0, fc="none", ec=COLORS[1], lw=0.6)
-        axes.plot(x[unbounded], y[unbounded], "s", color=REFERENCE, ms=4.0)
-        axes.plot(*crosses[of_measured].T, "x", color=DARK, ms=4.5)
+        ring: dict[str, Any] = {"mfc": "none", "mec": COLORS[1], "ms": 7.0, "mew": 0.6}
+        square: dict[str, Any] = {"color": REFERENCE, "ms": 4.0}
+        for of_mark, marker, style, label in (
+            (beyond, "o", ring, "less certain than every measured pose"),
+            (unbounded, "s", square, "not bounded by the data, or out of reach"),
+        ):
+            if of_mark.any():
+                axes.plot(x[of_mark], y[of_mark], marker, label=label, **style)
+        axes.plot(*crosses[of_measured].T, "x", color=DARK, ms=4.5, label="measured pose")
         if set(names) <= set(POSITION):
             axes.set_aspect("equal", adjustable="datalim")
         label_axes(axes, labels[0], labels[1] if axes is panels[0] else "", title)
@@ -263,12 +255,12 @@ def _draw_line(
 ) -> None:
     """Draw the uncertainty of a machine with one coordinate against it."""
     of_axis = _unit_of(accuracy.names[0])
-    for uncertainty, places, marker, color in (
-        (accuracy.uncertainty, accuracy.coordinates, ".", COLORS[0]),
-        (accuracy.measured, measured, "x", DARK),
+    for uncertainty, places, marker, color, words in (
+        (accuracy.uncertainty, accuracy.coordinates, ".", COLORS[0], "pose of the workspace"),
+        (accuracy.measured, measured, "x", DARK, "measured pose"),
     ):
-        values = getattr(uncertainty, name) / unit.factor_to_si
-        axes.plot(places[:, 0] / of_axis.factor_to_si, values, marker, color=color, lw=THIN)
+        x, y = places[:, 0] / of_axis.factor_to_si, getattr(uncertainty, name) / unit.factor_to_si
+        axes.plot(x, y, marker, color=color, label=words)
     label_axes(axes, f"{accuracy.names[0]} [{of_axis.symbol}]", label)
 
 
@@ -397,8 +389,12 @@ def _list_faces(
 
 # Errors on measured poses before and after calibration, beside the noise floor and the limits.
 
-BEFORE, AFTER, LIMIT = COLORS[1], COLORS[0], COLORS[3]
-"""Colors of errors before and after calibration, and of a limit."""
+BEFORE, AFTER = COLORS[1], COLORS[0]
+"""Colors of errors before and after calibration."""
+
+# Styles of the line of a limit, and of that of the noise floor.
+LIMIT: dict[str, Any] = {"color": COLORS[3], "lw": LINE, "ls": "-.", "label": "limit"}
+FLOOR: dict[str, Any] = {**DASHED, "label": "noise floor (rms)"}
 
 GOOD, OPEN, BAD = "#cfeadf", "#f3eccb", "#f6d5c3"
 """Colors of what a decision rule accepts, leaves open and rejects."""
@@ -429,15 +425,7 @@ def draw_validation(validation: Validation) -> Figure:
         _draw_kinds(panels[n - 1, 0], validation)
     for (axes,), (quantity, conformity) in zip(panels[n:], decisions.items(), strict=True):
         _draw_decision(axes, quantity, conformity, validation.units[quantity])
-    before: dict[str, Any] = {"color": BEFORE, "marker": "s", "mfc": "none", "ms": DOT, "lw": LINE}
-    handles = [
-        make_handle("before, line: rms", **before),
-        make_handle("after, line: rms", color=AFTER, marker="o", ms=DOT, lw=LINE),
-        make_handle("noise floor (rms)", **DASHED),
-    ]
-    if any(limits.get(quantity) is not None for quantity in quantities):
-        handles.append(make_handle("limit", color=LIMIT, lw=LINE, ls="-."))
-    add_legend(figure, handles)
+    add_legend(figure)
     poses = name_count(validation.judged, "pose")
     return finish_figure(figure, f"Errors at {poses}, {validation.frame}")
 
@@ -460,7 +448,7 @@ def _draw_decision(axes: Axes, quantity: str, conformity: Conformity, unit: Unit
         if end - start > LEAST_ROOM * right:
             place = (0.5 * (start + end), 0.86)
             axes.annotate(word, place, va="center", ha="center", fontsize=SMALL, color=DARK)
-    axes.axvline(limit, color=LIMIT, lw=LINE, ls="-.")
+    axes.axvline(limit, **LIMIT)
     axes.errorbar(
         [error], [0.4], xerr=[[error - low], [high - error]], fmt="o", color=AFTER, ms=2 * DOT,
         lw=2 * LINE, capsize=4.0,
@@ -483,25 +471,25 @@ def _draw_quantity(axes: Axes, validation: Validation, quantity: str, limit: flo
     after = validation.after
     size_after = [after.statistics(quantity).rms, validation.noise_floor.rms[quantity]]
     unit, largest = choose_unit(validation.units[quantity], size_after), []
-    for errors, marker, color, face in (
-        (validation.before, "s", BEFORE, "none"),
-        (after, "o", AFTER, AFTER),
+    for name, errors, marker, color, face in (
+        ("before", validation.before, "s", BEFORE, "none"),
+        ("after", after, "o", AFTER, AFTER),
     ):
         size, x = errors[quantity].size / unit.factor_to_si, place[errors[quantity].rows]
         largest += [float(size[np.isfinite(size)].max())] if np.isfinite(size).any() else []
-        axes.plot(x, size, marker, ls="none", color=color, mfc=face, ms=DOT + 0.5)
-        axes.axhline(errors.statistics(quantity).rms / unit.factor_to_si, color=color, lw=LINE)
-    axes.axhline(validation.noise_floor.rms[quantity] / unit.factor_to_si, **DASHED)
+        axes.plot(x, size, marker, color=color, mfc=face, ms=DOT + 0.5, label=name)
+        rms = errors.statistics(quantity).rms / unit.factor_to_si
+        axes.axhline(rms, color=color, lw=LINE, label=f"{name} (rms)")
+    axes.axhline(validation.noise_floor.rms[quantity] / unit.factor_to_si, **FLOOR)
     if limit is not None:
-        axes.axhline(limit / unit.factor_to_si, color=LIMIT, lw=LINE, ls="-.")
+        axes.axhline(limit / unit.factor_to_si, **LIMIT)
     if len(largest) == 2 and 0.0 < LOGARITHMIC * largest[1] < largest[0]:
         scale_logarithmically(axes.yaxis)
     else:
         axes.set_ylim(bottom=0.0)
     measured = after[quantity].measured
     named = f" ({', '.join(measured)})" if quantity == "position" and len(measured) < 3 else ""
-    rms = f"{after.statistics(quantity).rms / unit.factor_to_si:.3g} {unit.symbol}"
-    title = f"{quantity}{named}: rms {rms} after"
+    title = f"{quantity}{named}: rms {rms:.3g} {unit.symbol} after"
     label_axes(axes, "", f"{quantity} error [{unit.symbol}]", title)
     label_poses(axes, labels)
 
@@ -514,12 +502,12 @@ def _draw_kinds(axes: Axes, validation: Validation) -> None:
     above: dict[str, Any] = {"textcoords": "offset points", "ha": "center", "fontsize": SMALL}
     filled: dict[str, Any] = {"color": AFTER}
     for name, by, style in (("before", -0.19, hatched), ("after", 0.19, filled)):
-        axes.bar(x + by, [getattr(k, name) for k in kinds], 0.38, **style)
+        axes.bar(x + by, [getattr(k, name) for k in kinds], 0.38, label=f"{name} (rms)", **style)
         for place, kind in zip(x + by, kinds, strict=True):
             if np.isfinite(value := getattr(kind, name)):
                 axes.annotate(f"{value:.3g}", (place, value), (0, 2), **above)
     for i, kind in enumerate(kinds):
-        axes.hlines(kind.noise_floor, i - 0.45, i + 0.45, color=REFERENCE, lw=LINE, ls="--")
+        axes.plot([i - 0.45, i + 0.45], [kind.noise_floor] * 2, **FLOOR)
     names = ["all kinds" if k.kind == "all" else k.kind for k in kinds]
     axes.set_xticks(x, [f"{n}\n{k.count} values" for n, k in zip(names, kinds, strict=True)])
     axes.set_xlim(-0.5 * max(FEWEST_BARS - len(kinds), 0) - 0.6, None)
@@ -539,9 +527,10 @@ def _draw_kinds(axes: Axes, validation: Validation) -> None:
 MOST_ROWS = 60  # parameters that a figure shows
 
 
-def _choose_style(k: int) -> dict[str, Any]:
-    """Return color and marker of run k."""
-    return {"color": COLORS[k % len(COLORS)], "marker": MARKERS[k % len(MARKERS)]}
+def _choose_style(k: int, name: str) -> dict[str, Any]:
+    """Return color, marker and label of run k, whose points no line joins."""
+    color, marker = COLORS[k % len(COLORS)], MARKERS[k % len(MARKERS)]
+    return {"color": color, "marker": marker, "ls": "none", "label": shorten(name)}
 
 
 def draw_run_parameters(comparison: RunComparison) -> Figure:
@@ -559,21 +548,20 @@ def draw_run_parameters(comparison: RunComparison) -> Figure:
     rows = [row for row in zip(comparison.parameters, intervals, references, strict=True) if row[2]]
     shown, count = rows[:MOST_ROWS], len(comparison.runs)
     figure = start_figure(7.2, 1.8 + 0.22 * max(len(shown), 1))
-    axes, handles = figure.add_subplot(), []
+    axes = figure.add_subplot()
     for k, run in enumerate(comparison.runs):
-        style, offset = {**_choose_style(k), "lw": LINE}, 0.6 * (k + 0.5) / count - 0.3
+        style, offset = _choose_style(k, run.name), 0.6 * (k + 0.5) / count - 0.3
         for row, (_, of_runs, reference) in enumerate(shown):
             value, half = of_runs[k]
             if value is not None and half is not None:
                 center, unit = reference or (0.0, 1.0)
                 x, bar = (value - center) / unit, half / unit
                 axes.errorbar(x, row + offset, xerr=bar, ms=DOT + 0.5, capsize=2.0, **style)
-        handles.append(make_handle(shorten(run.name), **style))
     axes.axvline(0.0, **ZERO)
     label_rows(axes, [shorten(name) for name, *_ in shown])
     first = shorten(comparison.runs[0].name)
     label_axes(axes, f"difference from {first} [half-widths of its 95 % interval]", "")
-    add_legend(figure, handles)
+    add_legend(figure)
     part = f" (the first {len(shown)} of {len(rows)} parameters)" if len(rows) > len(shown) else ""
     return finish_figure(figure, f"Estimates with their 95 % intervals{part}")
 
@@ -596,11 +584,10 @@ def draw_run_errors(comparison: RunComparison) -> Figure:
         axes.set_xlim(-0.6, len(errors) - 0.4)
         axes.set_ylim(bottom=0.0)
         label_axes(axes, "", f"{quantity} error [{unit.symbol}]")
-    dot = make_handle("largest", ls="none", marker="o", color="0.2")
-    add_legend(figure, [make_patch("root mean square", REFERENCE), dot])
     common = f"{comparison.common_poses} common poses"
     poses = common if has_common else "held-out poses of each run"
-    return finish_figure(figure, f"Errors after calibration at the {poses}")
+    words = f"Errors after calibration at the {poses}; bars: root mean square, dots: largest"
+    return finish_figure(figure, words)
 
 
 @register("figure", CheckUp)
@@ -610,9 +597,10 @@ def draw_check_up(result: CheckUp) -> Figure:
     figure, panels = start_panels(7.2, 3.4 + 2.2 * n, n + 1, 1, sharex=True)
     alarm = np.array([check.alarm for check in result.checks])
     p_values = np.maximum([check.p_value for check in result.checks], SMALLEST_SHOWN)
-    for chosen, color in ((~alarm, COLORS[0]), (alarm, COLORS[1])):
-        panels[0, 0].plot(x[chosen], p_values[chosen], "o", color=color, ms=DOT + 1.0)
-    panels[0, 0].axhline(result.level, **DASHED)
+    for chosen, color, label in ((~alarm, COLORS[0], "check"), (alarm, COLORS[1], "alarm")):
+        style = {"color": color, "ms": DOT + 1.0, "label": label}
+        panels[0, 0].plot(x[chosen], p_values[chosen], "o", **style)
+    panels[0, 0].axhline(result.level, **DASHED, label="level of the alarm")
     panels[0, 0].set_yscale("log")
     scale_logarithmically(panels[0, 0].yaxis)
     label_axes(panels[0, 0], "", "probability if unchanged [1]")
@@ -625,12 +613,7 @@ def draw_check_up(result: CheckUp) -> Figure:
     every = slice(None, None, -(-len(x) // MOST_LABELS))
     names = [shorten(check.name) for check in result.checks]
     panels[-1, 0].set_xticks(x[every], names[every], rotation=45, ha="right")
-    handles = [
-        make_handle("check", color=COLORS[0], marker="o", ls="none"),
-        make_handle("alarm", color=COLORS[1], marker="o", ls="none"),
-        make_handle("level of the alarm", **DASHED),
-    ]
-    add_legend(figure, handles)
+    add_legend(figure)
     share = f"{100.0 * result.false_alarms:.3g} %"
     return finish_figure(figure, f"Checks since the calibration; false alarms: {share} a year")
 
@@ -647,31 +630,27 @@ def draw_run_shifts(comparison: RunComparison) -> Figure:
     """
     names, total = comparison.parameters[:MOST_ROWS], len(comparison.parameters)
     figure = start_figure(7.2, 1.8 + 0.2 * len(names))
-    axes, handles, y, lines = figure.add_subplot(), [], np.arange(len(names)), []
+    axes, y, lines = figure.add_subplot(), np.arange(len(names)), []
     words = {True: "has changed", False: "no change", None: "not tested"}
     for k, pair in enumerate(comparison.pairs, 1):  # the first run has color and marker 0
         shifts = [pair.find_shift(name) for name in names]
-        style = {**_choose_style(k), "ls": "none"}
+        style = _choose_style(k, pair.second)
         size = np.array([shift / sd if sd > 0.0 else np.nan for shift, sd, _ in shifts])
         significant = np.array([flag for _, _, flag in shifts])
         offset = 0.5 * k / (len(comparison.pairs) + 1) - 0.25
         for chosen, face in ((significant, style["color"]), (~significant, "white")):
             axes.plot(size[chosen], (y + offset)[chosen], mfc=face, ms=DOT + 2, **style)
-        second = shorten(pair.second)
-        handles.append(make_handle(second, **style))
         explained = pair.moved and pair.cause.names
         cause = f"; a change of {' and '.join(pair.cause.names)} alone explains it"
-        lines.append(f"{second}: {words[pair.moved]}{cause if explained else ''}")
-    axes.axvspan(-1.96, 1.96, color=PALE, alpha=0.35, lw=0.0, zorder=0)
+        lines.append(f"{style['label']}: {words[pair.moved]}{cause if explained else ''}")
+    band: dict[str, Any] = {"color": PALE, "alpha": 0.35, "lw": 0.0, "zorder": 0}
+    axes.axvspan(-1.96, 1.96, label="95 % of a single shift", **band)
+    axes.plot([], [], "o", color=DARK, label="filled: significant")
     axes.axvline(0.0, **ZERO)
     label_rows(axes, [shorten(name) for name in names])
     first = shorten(comparison.runs[0].name)
     label_axes(axes, f"shift from {first} [standard deviations]", "")
-    handles += [
-        make_handle("95 % of a single shift", color=PALE, lw=6, alpha=0.5),
-        make_handle("filled: significant", color=DARK, marker="o", ls="none"),
-    ]
-    add_legend(figure, handles)
+    add_legend(figure)
     lines += [f"the first {MOST_ROWS} of {total} parameters"] if total > MOST_ROWS else []
     return finish_figure(figure, "\n".join(lines))
 
@@ -700,11 +679,7 @@ def draw_height_errors(heights: HeightErrors) -> Figure:
         points = _draw_heights(axes, heights, name, limit)
     label = f"height error, predicted - measured [{symbol}]"
     add_colorbar(figure, points, list(panels), label, aspect=24, pad=0.02)
-    handles = []
-    for name, _ in heights.list_sets():
-        marker, words = HEIGHT_MARKERS[name]
-        handles.append(make_handle(words, ls="none", marker=marker, mfc="none", mec=DARK))
-    add_legend(figure, handles)
+    add_legend(figure)
     return finish_figure(figure, f"Height errors at {len(heights.poses)} points")
 
 
@@ -716,7 +691,8 @@ def _draw_heights(axes: Axes, heights: HeightErrors, name: str, limit: float) ->
     style: dict[str, Any] = {"cmap": DIVERGING, "vmin": -limit, "vmax": limit, "s": AREA}
     drawn, rms = None, []
     for of_set, is_held_out in heights.list_sets():
-        chosen, (marker, _) = heights.is_held_out == is_held_out, HEIGHT_MARKERS[of_set]
+        chosen, (marker, words) = heights.is_held_out == is_held_out, HEIGHT_MARKERS[of_set]
+        axes.plot([], [], marker, mfc="none", mec=DARK, label=words)
         places = x[chosen], y[chosen]
         drawn = axes.scatter(*places, c=errors[chosen], marker=marker, ec=DARK, lw=0.7, **style)
         rms.append(f"{of_set} {heights.statistics(name, is_held_out).rms / factor:.3g}")
@@ -771,16 +747,7 @@ def draw_plan(plan: Plan) -> Figure:
         _draw_route(axes, np.arange(len(stops), dtype=float), stops[:, single], poses)
         label_sparsely(axes.xaxis)
         label_axes(axes, "step [1], home is 0", labels[single])
-    handles = [
-        make_handle("calibration", color=CALIBRATION, marker="o", ls="none"),
-        make_handle("home", color="black", marker="+", ls="none"),
-        make_handle("path", color=PALE, lw=THIN),
-    ]
-    if poses.held_out.any():
-        handles.insert(1, make_handle("validation", color=VALIDATION, marker="s", ls="none"))
-    if poses.via_home.any():
-        handles.append(make_handle("path via home", color=PALE, lw=THIN, ls="--"))
-    add_legend(figure, handles)
+    add_legend(figure)
     held_out = int(poses.held_out.sum())
     fitted = f"n = {len(poses) - held_out} poses for calibration"
     words = f"{fitted}, {held_out} for validation, numbered in their order"
@@ -795,18 +762,24 @@ def _draw_route(axes: Axes, x: FloatArray, y: FloatArray, poses: PlannedPoses) -
         segments = [(k - 1, 0, "--"), (0, k, "--")] if poses.via_home[k - 1] else [(k - 1, k, "-")]
         for start, end, line in segments:
             ends = x[[start, end]], y[[start, end]]
-            axes.plot(*ends, color=PALE, lw=THIN, ls=line, zorder=1)
+            label = "path" if line == "-" else "path via home"
+            axes.plot(*ends, color=PALE, lw=THIN, ls=line, zorder=1, label=label)
             middle = ends[0].mean(), ends[1].mean()
             before = 0.52 * ends[0][0] + 0.48 * ends[0][1], 0.52 * ends[1][0] + 0.48 * ends[1][1]
             if np.ptp(ends[0]) > 0.0 or np.ptp(ends[1]) > 0.0:
                 arrow = {"arrowstyle": "-|>", "color": REFERENCE, "lw": 0.0, "mutation_scale": 7.0}
                 axes.annotate("", middle, before, arrowprops=arrow, zorder=1)
-    axes.plot(x[0], y[0], "k+", ms=9.0, mew=1.4, zorder=3)
+    axes.plot(x[0], y[0], "k+", ms=9.0, mew=1.4, zorder=3, label="home")
     x, y, held_out = x[1:], y[1:], poses.held_out
     is_numbered = len(held_out) <= MOST_NUMBERED
     size = DISK if is_numbered else DOT
-    for chosen, color, marker in ((~held_out, CALIBRATION, "o"), (held_out, VALIDATION, "s")):
-        axes.plot(x[chosen], y[chosen], marker, color=color, ms=size, zorder=2)
+    for chosen, color, marker, label in (
+        (~held_out, CALIBRATION, "o", "calibration"),
+        (held_out, VALIDATION, "s", "validation"),
+    ):
+        if chosen.any():
+            style: dict[str, Any] = {"color": color, "ms": size, "label": label, "zorder": 2}
+            axes.plot(x[chosen], y[chosen], marker, **style)
     if is_numbered:
         for members in _find_clusters(x, y):
             _write_numbers(axes, x, y, members)
@@ -891,28 +864,25 @@ def draw_surface_plan(plan: SurfacePlan) -> Figure:
         (COLORS[i % len(COLORS)], MARKERS[i // len(COLORS) % len(MARKERS)])
         for i in range(len(places))
     ]
+    labels = [f"group {i}, line along {POSITION[axis]}" for i, axis in enumerate(plan.axis, 1)]
+    labels = labels if len(labels) <= MOST_GROUPS else [""] * len(labels)
     figure, (panels,) = start_panels(12.6, 5.0, 1, len(VIEWS))
+    for words, width in (("line: points 1 and 2", 2.2), ("plane: point 1 and others", THIN)):
+        panels[0].plot([], [], "o-", color=DARK, lw=width, ms=DOT, label=words)
     for axes, view in zip(panels, VIEWS, strict=True):
-        for points, (color, marker) in zip(places[:, :, view], styles, strict=True):
+        for points, label, (color, marker) in zip(places[:, :, view], labels, styles, strict=True):
             axes.plot(*points[:2].T, "-", color=color, lw=2.2, zorder=2)
             for point in points[2:]:  # a fan of thin lines in the plane
                 ends = np.stack([points[0], point])
                 axes.plot(*ends.T, "-", color=color, lw=THIN, alpha=0.6, zorder=1)
-            axes.plot(*points.T, marker, color=color, ms=DOT + LINE, ls="none", zorder=3)
+            style: dict[str, Any] = {"color": color, "ms": DOT + LINE, "zorder": 3}
+            axes.plot(*points.T, marker, label=label, **style)
         _number_surfaces(axes, places[:, 0, view])
         axes.set_aspect("equal", adjustable="datalim")
         axes.margins(0.12)
         x, y = (POSITION[i] for i in view)
         label_axes(axes, f"{x} [{unit.symbol}]", f"{y} [{unit.symbol}]")
-    handles = [
-        make_handle("line: points 1 and 2", color=DARK, lw=2.2, marker="o", ms=DOT),
-        make_handle("plane: point 1 and others", color=DARK, lw=THIN, marker="o", ms=DOT),
-    ]
-    if len(places) <= MOST_GROUPS:
-        for i, (color, marker) in enumerate(styles):
-            label = f"group {i + 1}, line along {POSITION[plan.axis[i]]}"
-            handles.append(make_handle(label, color=color, marker=marker, ms=DOT + 1, ls="none"))
-    add_legend(figure, handles)
+    add_legend(figure)
     groups, points = plan.poses.groups.shape
     planes = f"{name_count(groups, 'plane')} with a perpendicular line"
     return finish_figure(figure, f"{plan.robot.name}: {planes}, n = {points} points in each")

@@ -93,29 +93,21 @@ def finish_figure(figure: Figure, title: str) -> Figure:
     return show_names(figure)
 
 
-def make_handle(label: str, **style: Any) -> Any:
-    """Return a line or marker for a legend."""
-    from matplotlib.lines import Line2D
-
-    return Line2D([], [], label=label, **style)
-
-
-def make_patch(label: str, color: str) -> Any:
-    """Return an area for a legend."""
-    from matplotlib.patches import Patch
-
-    return Patch(color=color, label=label)
-
-
-def add_legend(figure: Figure, handles: list[Any], most: int = MOST_COLUMNS) -> None:
-    """Write a legend below all axes, where no data are: as many columns as fit, at most `most`."""
-    if handles:
-        longest = max(len(str(handle.get_label())) for handle in handles) + HANDLE
-        columns = int(figure.get_size_inches()[0] * CHARACTERS / longest)
+def add_legend(figure: Figure, most: int = MOST_COLUMNS) -> None:
+    """Write a legend of everything drawn that has a label, each label once, below all axes, where
+    no data are: as many columns as fit, at most `most`.
+    """
+    drawn: dict[str, Any] = {}
+    for axes in figure.axes:
+        for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
+            drawn.setdefault(label, handle)
+    if drawn:
+        columns = int(figure.get_size_inches()[0] * CHARACTERS / (max(map(len, drawn)) + HANDLE))
         figure.legend(
-            handles=handles,
+            drawn.values(),
+            drawn.keys(),
             loc="outside lower center",
-            ncols=min(max(columns, 1), most, len(handles)),
+            ncols=min(max(columns, 1), most, len(drawn)),
             frameon=False,
             fontsize=SMALL,
         )

@@ -44,7 +44,6 @@ from loopcal.report.figures.style import (
     add_legend,
     finish_figure,
     label_axes,
-    make_handle,
     start_figure,
 )
 from loopcal.results.presenters import register
@@ -53,6 +52,7 @@ from loopcal.typing import FloatArray, IntArray
 from loopcal.units import DISPLAY_UNITS, Dimension, Unit, find_unit
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 LONGEST = 0.15  # length of the longest drawn error or motion, as a share of the robot's size
@@ -570,7 +570,8 @@ def draw_robot(robot: Mechanism) -> Figure:
             name, place = f"  {limb.name}", points[0]
             space.text(*place, name, fontsize=SMALL, color=style["color"], zorder=9)
     _finish(space, above, low, high, length.symbol, shown)
-    add_legend(figure, _list_handles(parts, "xy" if is_flat else "xyz"))
+    _label_parts(above, parts, "xy" if is_flat else "xyz")
+    add_legend(figure)
     counts = {
         "limb": len(limbs),
         "joint": sum(len(limb.joints) for limb in limbs),
@@ -659,12 +660,12 @@ def _finish(
     space.set_title("perspective", fontsize=LABEL)
 
 
-def _list_handles(parts: tuple[Part, ...], names: str) -> list[Any]:
-    """Return a handle for everything that a picture contains; `names` of the axes of frames."""
+def _label_parts(axes: Axes, parts: tuple[Part, ...], names: str) -> None:
+    """Label everything that a picture contains, for its legend; `names` of the axes of frames."""
     roles, driven = {part.role for part in parts}, {part.role for part in parts if part.is_driven}
     marker = "s" if "slide" in driven else "o" if "joint" in driven else "D"
     guide = {"color": "0.4", "lw": 1.0, "ls": (0, (4, 3))}
-    axes = zip(names, FRAME_COLORS, strict=False)
+    of_frames = zip(names, FRAME_COLORS, strict=False)
     has_axes = "axis" in roles and names == "xyz"
     rows: list[tuple[str, bool, dict[str, Any]]] = [
         ("axis of a revolute joint", has_axes, {"color": "black", "lw": 1.2}),
@@ -673,9 +674,11 @@ def _list_handles(parts: tuple[Part, ...], names: str) -> list[Any]:
         ("driven, filled", True, _dot(marker, "0.4", "0.4")),
         ("platform", True, {"color": "0.25", "lw": 2.0}),
         ("tool", True, _dot("*", "black", "black", 8.0)),
-        *((f"{axis} of base and tool", True, {"color": color, "lw": 1.4}) for axis, color in axes),
+        *((f"{name} of base and tool", True, {"color": c, "lw": 1.4}) for name, c in of_frames),
     ]
-    return [make_handle(label, **style) for label, is_drawn, style in rows if is_drawn]
+    for label, is_drawn, style in rows:
+        if is_drawn:
+            axes.plot([], [], label=label, **style)
 
 
 def draw_scene(scene: Scene) -> Figure:
