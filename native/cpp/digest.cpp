@@ -403,7 +403,7 @@ int main() {
         for (bool torsion : {false, true}) add_targets(set, 5, 45, torsion, digest);
         for (int64_t n : {1, 13, 50}) add_comparisons(set, n, digest);
         for (int64_t k : {1, 3}) add_points(set, 21, k, digest);
-        for (int64_t height : {5, 40}) add_blocks(set, 3, height, 9, digest);
+        for (int64_t height : {5, 40, 80}) add_blocks(set, 3, height, 9, digest);
         for (int64_t p : {1, 7, 43}) add_factors(set, 11, 50, p, digest);
         add_factors(set, 3, 1000, 7, digest);
         std::printf("%016llx %s\n", (unsigned long long)digest.value, name);

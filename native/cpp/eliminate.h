@@ -5,7 +5,8 @@
 // The rows of a block are [own | those of its ancestors | A | r]. ROWS of them at a time are
 // reflected into a triangle of its own columns (fold.h); what the reflections leave are rows of the
 // parent, and those of blocks without a parent are folded into the factor of [A | r]. So each row
-// passes from its block to the machine while it is in the cache, and nothing else is kept.
+// passes from its block to the machine while it is in the cache, and nothing else is kept. Of many
+// rows, those of the machine are dealt to PARTS factors, ROWS at a time, with a lane for each part.
 #pragma once
 
 #include "fold.h"
@@ -73,6 +74,57 @@ struct ArrivingRows {
     }
 };
 
+// Factors of the rows of the machine by parts, folded together in the end.
+class DealtRows {
+  public:
+    DealtRows(Arena &arena, int64_t p) : p_(p) {
+        factor_ = arena.take<Lanes>(CHUNKS * packed(p, p)), block_ = arena.take<Lanes>(CHUNKS * p * ROWS);
+        parts_ = arena.take<double>(PARTS * p * p);
+    }
+
+    static size_t need(int64_t p) {
+        return Arena::need<Lanes>(CHUNKS * packed(p, p)) + Arena::need<Lanes>(CHUNKS * p * ROWS) +
+               Arena::need<double>(PARTS * p * p);
+    }
+
+    void begin() {
+        part_ = 0;
+        for (int64_t i = 0; i < CHUNKS * packed(p_, p_); i++) factor_[i] = Lanes{};
+        for (int64_t i = 0; i < CHUNKS * p_ * ROWS; i++) block_[i] = Lanes{};
+    }
+
+    // block : (ROWS, width), the rows of the next part
+    void deal(const double *block, int64_t width) {
+        Lanes *to = block_ + part_ / W * p_ * ROWS;
+        for (int64_t j = 0; j < p_; j++)
+            for (int i = 0; i < ROWS; i++) to[j * ROWS + i][part_ % W] = block[i * width + j];
+        if (++part_ == PARTS) fold();
+    }
+
+    // The factors (PARTS, p, p).
+    const double *finish() {
+        if (part_) fold();
+        for (int64_t c = 0; c < CHUNKS; c++) {
+            int64_t count = PARTS - c * W < W ? PARTS - c * W : W;
+            store_factors(factor_ + c * packed(p_, p_), count, p_, parts_ + c * W * p_ * p_);
+        }
+        return parts_;
+    }
+
+  private:
+    static constexpr int64_t CHUNKS = (PARTS + W - 1) / W;
+
+    void fold() {
+        for (int64_t c = 0; c < CHUNKS; c++) fold_block(factor_ + c * packed(p_, p_), block_ + c * p_ * ROWS, p_);
+        for (int64_t i = 0; i < CHUNKS * p_ * ROWS; i++) block_[i] = Lanes{};
+        part_ = 0;
+    }
+
+    int64_t p_, part_ = 0;
+    Lanes *factor_, *block_;
+    double *parts_;
+};
+
 INLINE const double *find_row(const loopcal::Strided &rows, int64_t trial, int64_t row) {
     return rows.data + trial * rows.trial + row * rows.pose;
 }
@@ -98,11 +150,19 @@ class BlockElimination {
     }
 
     // length : of the columns of all unknowns. False where a block is not certainly of full rank.
-    bool run(int64_t trial, const double *length, double *factor, double *explained) {
-        trial_ = trial, length_ = length, explained_ = 0.0, is_regular_ = true;
+    // dealt : for many rows, or null.
+    bool run(int64_t trial, const double *length, double *factor, double *explained, DealtRows *dealt) {
+        trial_ = trial, length_ = length, explained_ = 0.0, is_regular_ = true, dealt_ = dealt;
         at_[0].begin(right_, right_);
+        if (dealt) dealt->begin();
         eliminate_children(lists_.blocks, 0);
         if (at_[0].filled) fold(0);
+        if (dealt) {
+            const double *rows = dealt->finish();
+            dealt_ = nullptr;
+            for (int64_t i = 0; i < PARTS * right_; i++) append(0, rows + i * right_, right_);
+            if (at_[0].filled) fold(0);
+        }
         for (int64_t i = 0; i < right_; i++)
             for (int64_t j = 0; j < right_; j++)
                 factor[i * right_ + j] = j < i ? 0.0 : at_[0].triangle[i * at_[0].width + j];
@@ -152,8 +212,10 @@ class BlockElimination {
     void fold(int64_t depth) {
         ArrivingRows &at = at_[depth];
         int64_t height = at.filled, begun = at.is_begun ? 0 : height < at.own ? height : at.own;
-        fold_block_by_columns(at.triangle, at.block, at.own, at.width, begun);
-        at.is_begun = true, at.filled = 0;
+        const bool is_dealt = dealt_ && !depth;
+        if (is_dealt) dealt_->deal(at.block, at.width);
+        else fold_block_by_columns(at.triangle, at.block, at.own, at.width, begun);
+        at.is_begun = !is_dealt, at.filled = 0;
         for (int64_t i = begun; depth && i < height; i++)
             append(depth - 1, at.block + i * at.width + at.own, at.columns - at.own);
         std::memset(at.block, 0, sizeof(double) * (size_t)(ROWS * at.width));
@@ -189,6 +251,7 @@ class BlockElimination {
     double limit_, explained_ = 0.0;
     const double *length_ = nullptr;
     bool is_regular_ = true;
+    DealtRows *dealt_ = nullptr;
     ArrivingRows *at_;
     double *growth_;
 };
@@ -238,22 +301,26 @@ inline int eliminate_blocks(const loopcal::BlockStructure *structures, int64_t c
                             int64_t right, double limit, double *factor, double *values, double *length,
                             double *explained, int8_t *is_regular) {
     BlockLists all{structures, parts, count, pieces, 0, 0, nullptr, nullptr, nullptr, nullptr, nullptr, nullptr};
-    int64_t own = 0, columns = right;
+    int64_t own = 0, columns = right, height = 0;
     for (int64_t s = 0; s < count; s++) {
         all.blocks += structures[s].count;
         own = structures[s].own > own ? structures[s].own : own;
         columns = structures[s].width + right > columns ? structures[s].width + right : columns;
     }
-    for (int64_t p = 0; p < pieces; p++) all.rows += parts[p].count;
+    for (int64_t p = 0; p < pieces; p++) all.rows += parts[p].count, height += parts[p].count * parts[p].height;
+    const bool is_dealt = height >= MANY * right;
     Arena memory(BlockLists::need(count, all.blocks, all.rows));
     Arena arena(BlockElimination::need(count + 1, own, columns, right));
-    if (!memory.ok() || !arena.ok()) return loopcal::NO_MEMORY;
+    Arena of_parts(is_dealt ? DealtRows::need(right) : 0);
+    if (!memory.ok() || !arena.ok() || !of_parts.ok()) return loopcal::NO_MEMORY;
     all.list(memory);
     BlockElimination elimination(all, right, limit, arena, count + 1, own, columns);
+    DealtRows dealt(of_parts, is_dealt ? right : 0);
     for (int64_t i = 0; i < t; i++) {
         double *own_length = length + i * unknowns;
         measure_columns(all, i, own_length, unknowns);
-        is_regular[i] = elimination.run(i, own_length, factor + i * right * right, explained + i);
+        is_regular[i] = elimination.run(i, own_length, factor + i * right * right, explained + i,
+                                        is_dealt ? &dealt : nullptr);
         if (is_regular[i]) substitute_blocks(all, right, i, values + i * unknowns * right);
     }
     return loopcal::DONE;

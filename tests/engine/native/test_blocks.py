@@ -20,9 +20,10 @@ P, SESSIONS, GROUPS = 5, 3, 4
 ROTATION = ("frame.rx", "frame.ry", "frame.rz")
 
 
-def draw_rows(t: int, open_trial: int | None = None) -> NodeFactors:
+def draw_rows(t: int, open_trial: int | None = None, more: int = 0) -> NodeFactors:
     """Return rows of two unknowns of the machine, two of each session, and three of each of its
-    groups, in t trials; in one of them the last unknown of a group has no row.
+    groups, in t trials; in one of them the last unknown of a group has no row. With `more` rows of
+    each group, those of the machine are dealt to parts.
     """
     scopes, sets, rng = ["machine"] * 2, [], np.random.default_rng(t)
     for _ in range(SESSIONS):
@@ -39,7 +40,7 @@ def draw_rows(t: int, open_trial: int | None = None) -> NodeFactors:
     size = 10.0 ** rng.uniform(-3, 3, len(scopes))
     for k, some in enumerate(sets):
         used, count = np.array(some), int(rng.integers(2, 20))  # two rows do not fill three columns
-        count += 5 if k % GROUPS else 0
+        count += more + (5 if k % GROUPS else 0)
         F = rng.normal(size=(t, 1, count, len(used))) * size[used]
         if open_trial is not None and k == 1:
             F[open_trial, ..., -1] = 0.0
@@ -58,9 +59,10 @@ def list_results(factors: NodeFactors) -> list[np.ndarray]:
     return [gram, *values, variance, done.explained, done.rank, done.is_unobservable]
 
 
+@pytest.mark.parametrize("more", [0, 30])
 @pytest.mark.parametrize("open_trial", [None, 1])
-def test_blocks_are_eliminated_as_in_numpy(open_trial):
-    factors, results = draw_rows(3, open_trial), []
+def test_blocks_are_eliminated_as_in_numpy(open_trial, more):
+    factors, results = draw_rows(3, open_trial, more), []
     for name in ("numpy", "native"):
         with use_engine(name):
             results.append(list_results(factors))
@@ -89,9 +91,10 @@ def test_priors_of_one_row_each_are_read_where_their_memory_has_other_steps(t):
     assert_allclose(results[0][3], np.ones((t, 6)))  # variances over lengths
 
 
+@pytest.mark.parametrize("more", [0, 30])
 @pytest.mark.parametrize("t", [1, 3])
-def test_blocks_have_the_same_bits_for_every_instruction_set_and_alone(t):
-    factors = draw_rows(t)
+def test_blocks_have_the_same_bits_for_every_instruction_set_and_alone(t, more):
+    factors = draw_rows(t, more=more)
     shape = t, len(factors.tree.node), P
     functions = [e.eliminate_blocks for e in ENGINES.values() if e.eliminate_blocks is not None]
     assert len(functions) == len(ENGINES)
@@ -100,8 +103,8 @@ def test_blocks_have_the_same_bits_for_every_instruction_set_and_alone(t):
     assert done[0].is_regular.all()
     assert_same_bits([(*each[:5], *sum(each.solutions, ())) for each in done])
     with use_engine("native"):
-        together, rest = eliminate_tree(draw_rows(3, open_trial=0))
-        regular, its_rest = eliminate_tree(draw_rows(3))
+        together, rest = eliminate_tree(draw_rows(3, 0, more))
+        regular, its_rest = eliminate_tree(draw_rows(3, more=more))
     for trial in (1, 2):  # whatever the rows of the first trial leave open
         assert_array_equal(together.shift[trial], regular.shift[trial])
         assert_array_equal(rest[trial], its_rest[trial])
