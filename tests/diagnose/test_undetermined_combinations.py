@@ -17,6 +17,7 @@ from loopcal.measure.measurements import Measurements
 from loopcal.measure.simulation import sample_truth
 from loopcal.mechanism.model import Mechanism
 from tests.diagnose.test_suggestions import TRANSLATIONAL
+from tests.robot_texts import load_text
 
 TOLERANCES = "tolerances: {lengths: {sd: 0.1}, angles: {sd: 0.02}}\n"
 
@@ -192,3 +193,34 @@ def test_plan_states_which_undetermined_combinations_are_harmless(tmp_path):
     (harmless,) = [f for f in plan.findings if f.code == "identifiability.frames-only"]
     assert (harmless.data["still"], harmless.data["count"]) == (33, 6)  # at nominal values
     assert "identifiability.changes-poses" not in {f.code for f in plan.findings}
+
+
+SLIDE = """
+format: 1
+family: limbs
+name: slide
+units: {length: mm, angle: deg}
+freedoms: [x]
+controlled: [x]
+drives: {q: {reads: length, stroke: [-50, 50], compliance: 1.0e-4, unknown: [offset, backlash,
+  compliance], length: {sd: 0.1}, compliances: {sd: 2.0e-5}}}
+conditions: {force.x: {range: [0, 500]}, temperature: {reference: 20, range: [15, 25]}}
+couplings: {grow: {of: length, sum: {slide.growth: 1}, condition: temperature, slope: 0.01,
+  unknown: [slope], slopes: {sd: 0.002}}}
+limbs:
+  - {name: slide, ending: rigid, chain: [{joint: P, name: way, axis: x, actuated: q},
+     {joint: P, name: growth, axis: x}]}
+workspace: {x: [-40, 40]}
+"""
+
+
+def test_what_shows_only_under_load_heat_or_reversal_is_not_harmless(tmp_path: Path) -> None:
+    robot = load_text(tmp_path, SLIDE)
+    data = measure_poses(robot.with_conditions({"force.x": 0.0, "temperature": 20.0}), 8)
+    found = analyze_identifiability(robot, data).summary
+    (changing,) = (f for f in found if f.code == "identifiability.changes-poses")
+    assert set(changing.data["names"]) == {"q.backlash", "q.compliance", "grow.slope"}
+    # 0.1 mm / 2, 2e-5 mm/N over 0 to 500 N, and 0.002 mm/K over 5 K to both sides
+    expected = np.sqrt(0.05**2 + (0.02 * 500 / np.sqrt(3e3)) ** 2 / 1e3 + 0.01**2 / 3)
+    assert changing.data["sizes"][0].value == pytest.approx(expected, rel=0.2)
+    assert not any(f.code == "identifiability.frames-only" for f in found)

@@ -27,6 +27,7 @@ from loopcal.estimate.information import frame_twists
 from loopcal.estimate.linearization import spread_states
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
+from loopcal.measure.simulation import draw_conditions
 from loopcal.mechanism.actuation import solve_at_pose
 from loopcal.mechanism.chains import locate_bodies
 from loopcal.mechanism.kinematics import compute_readings, find_directly_reachable, forward_trials
@@ -88,7 +89,7 @@ class SampledMotions(NamedTuple):
 @lru_cache(maxsize=2)  # a report asks several times for one calibrated robot
 def sample_motions(robot: Mechanism) -> SampledMotions:
     """Return motions of a robot about home, and in its workspace where the robot states one."""
-    T, D = observe_motions(robot, first := probe_readings(robot))
+    T, D = observe_motions(robot, first := _vary(robot, probe_readings(robot)))
     try:
         ranges = workspace_ranges(robot)
     except MechanismError:
@@ -96,7 +97,7 @@ def sample_motions(robot: Mechanism) -> SampledMotions:
     drawn = draw_coordinates(np.random.default_rng(0), robot.controlled, ranges, PROBES)
     solution = inverse(robot, drawn)
     allowed = check_limits(robot, robot.values[None], solution.q[None], solution.state)[0][0]
-    inside = solution.q[solution.converged & allowed]
+    inside = _vary(robot, solution.q[solution.converged & allowed])
     workspace = observe_motions(robot, inside)
     return SampledMotions(
         np.concatenate([T, workspace[0]]),
@@ -104,6 +105,14 @@ def sample_motions(robot: Mechanism) -> SampledMotions:
         len(workspace[0]),
         observe_bodies(robot, np.concatenate([first, inside])),
     )
+
+
+def _vary(robot: Mechanism, readings: FloatArray) -> FloatArray:
+    """Return readings (n, 2 a) at conditions from their ranges, with drawn directions of approach:
+    what shows only there, such as a compliance or a backlash, changes poses, too.
+    """
+    sides = np.random.default_rng(0).choice((-1.0, 1.0), readings.shape)
+    return np.concatenate([draw_conditions(robot, readings, 0), sides], axis=1)
 
 
 class WeighedMotions(NamedTuple):

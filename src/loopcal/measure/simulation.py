@@ -285,7 +285,7 @@ def simulate_trials(
         raise DataError("truth has no row. Give the parameter values of at least one machine")
     geometry = robot.nominal if controller is None else controller
     commanded = solve_commanded_poses(geometry, poses, *pose_names)
-    readings, n = _draw_conditions(robot, commanded.q, seed), len(commanded.q)
+    readings, n = draw_conditions(robot, commanded.q, seed), len(commanded.q)
     given = None if reading_sigma is None else broadcast_reading_sigma(reading_sigma, readings)
     check_closure(robot, kinds, given, n)
     mounted = instrument.with_tool(robot)
@@ -353,7 +353,7 @@ def _draw_noise(covariance: FloatArray, streams: Sequence[np.random.Generator]) 
     return np.einsum("trij,trj->tri", axes, drawn)
 
 
-def _draw_conditions(robot: Mechanism, readings: FloatArray, seed: Seed) -> FloatArray:
+def draw_conditions(robot: Mechanism, readings: FloatArray, seed: Seed) -> FloatArray:
     """Return readings (n, a) with conditions drawn from their ranges, for all trials the same."""
     out, stream = np.array(readings), make_random_stream(seed, 0, CONDITIONS)
     for i, actuator in enumerate(robot.actuators):

@@ -475,20 +475,20 @@ def _refuse_singular_start(robot: Mechanism, target: FloatArray) -> None:
         state = inverse_trials(robot, values, target, shake_joints(guess, seed))
         if state.status[0, 0] != engine.CONVERGED or abs(state.closure_sign[0, 0]) == 0.0:
             continue
-        found = [
-            (f"{robot.assembly.limbs[i].name}.{joint.name}", joint.dimension, float(value))
-            for group, own in zip(robot.program.groups, state.joints, strict=True)
-            for i, limb in zip(group.limbs, own[0, 0], strict=True)
-            for joint, value in zip(robot.assembly.limbs[i].joints, limb, strict=False)
-            if abs(value - joint.start) > STRETCHED * (robot.size if joint.kind == "P" else 1.0)
-        ]
+        found: dict[tuple[str, str, float], tuple[str, Quantity]] = {}
+        for group, own in zip(robot.program.groups, state.joints, strict=True):
+            for i, limb in zip(group.limbs, own[0, 0], strict=True):
+                name = robot.assembly.limbs[i].name
+                for joint, value in zip(robot.assembly.limbs[i].joints, limb, strict=False):
+                    least = STRETCHED * (robot.size if joint.kind == "P" else 1.0)
+                    if abs(value - joint.start) > least:
+                        shown = robot.to_quantity(float(value), joint.dimension)
+                        of_copies = name.rstrip("0123456789"), joint.name, round(value, 6)
+                        found.setdefault(of_copies, (f"{name}.{joint.name}", shown))
         if found:
-            raise MechanismError.of(
-                "mechanism.singular-start",
-                name=robot.name,
-                joints=tuple(name for name, _, _ in found),
-                values=tuple(robot.to_quantity(value, d) for _, d, value in found),
-            )
+            joints, values = zip(*found.values(), strict=True)
+            refused = {"name": robot.name, "joints": joints, "values": values}
+            raise MechanismError.of("mechanism.singular-start", **refused)
 
 
 def _build_chain(assembly: Assembly, units: Mapping[Dimension, str], record: Any) -> Mechanism:

@@ -18,7 +18,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from loopcal import engine
 from loopcal.engine import State
 from loopcal.errors import MechanismError
 from loopcal.findings import Finding, report_finding
@@ -183,11 +182,13 @@ def _name_directions(
 
 
 def _list_columns(robot: Mechanism, limb: int) -> dict[int, int]:
-    """Return freedom -> column of A, of the body on which a limb ends, or begins (end on base)."""
+    """Return freedom -> column of A, of the body on which a limb ends, or begins where that one has
+    more freedoms.
+    """
     ((group, k),) = ((g, g.limbs.index(limb)) for g in robot.program.groups if limb in g.limbs)
-    body = group.to[k] if group.to[k] != engine.BASE else group.on[k]
-    twists = enumerate(robot.program.unknown_twists)
-    return {f: column for column, (node, f) in twists if node == body}
+    twists = list(enumerate(robot.program.unknown_twists))
+    bodies = ({f: i for i, (node, f) in twists if node == b} for b in (group.to[k], group.on[k]))
+    return max(bodies, key=len)
 
 
 def _choose_axes(vectors: FloatArray) -> FloatArray:

@@ -422,7 +422,7 @@ def forward(robot: Mechanism, q: ArrayLike, start: Solution | None = None) -> So
     ------
     DataError : another number of columns than the robot has actuators.
     """
-    a = len(robot.actuators)
+    begin, a = _check_start(start), len(robot.actuators)
     readings = np.atleast_2d(np.asarray(q, dtype=float))
     is_short = readings.ndim == 2 and readings.shape[1] < a
     if is_short and readings.shape[1] == (commanded := robot.is_commanded).sum():
@@ -438,10 +438,18 @@ def forward(robot: Mechanism, q: ArrayLike, start: Solution | None = None) -> So
             f"({', '.join(actuator.name for actuator in robot.actuators)}). Give one reading for "
             "each"
         )
-    state = forward_trials(
-        robot, robot.values[None], readings[None], None if start is None else start.state
-    )
+    state = forward_trials(robot, robot.values[None], readings[None], begin)
     return make_solution(robot, state, readings[:, :a])
+
+
+def _check_start(start: Solution | None) -> State | None:
+    """Return the state of a start, None without one."""
+    if start is None:
+        return None
+    if not isinstance(start, Solution):
+        got = type(start).__name__
+        raise DataError(f"start is of type {got}. Give a Solution, as from forward or inverse")
+    return start.state
 
 
 def inverse(robot: Mechanism, target: ArrayLike, start: Solution | None = None) -> Solution:
@@ -463,7 +471,7 @@ def inverse(robot: Mechanism, target: ArrayLike, start: Solution | None = None) 
     ------
     DataError : another shape, or a matrix that is not a pose.
     """
-    begin = None if start is None else start.state
+    begin = _check_start(start)
     c = len(robot.controlled)
     shapes = f"(n, 4, 4) poses or (n, {c}) coordinates ({', '.join(robot.controlled)})"
     wanted = np.asarray(target, dtype=float)

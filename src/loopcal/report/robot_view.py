@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -103,12 +103,14 @@ def _build_triangle_table(robot: Mechanism) -> Table:
 def _build_sum_table(robot: Mechanism) -> Table:
     """Return what readings and couplings are sums of; no rows where readings are joint values."""
     sums, couplings = robot.assembly.rows, robot.assembly.couplings
+    turning, length = robot.assembly.turning_drives, robot.shown_units[Dimension.LENGTH]
     is_sum = any(row.weights not in ({}, {row.name: 1.0}) for row in sums)
-    rows = [
-        (row.name, format_sum(row.weights or dict.fromkeys(row.driven_joints, 1.0)))
-        for row in sums
-        if is_sum
-    ]
+    rows = []
+    for row in (row for row in sums if is_sum):
+        weights = row.weights or dict.fromkeys(row.driven_joints, 1.0)
+        is_length = row.dimension is Dimension.LENGTH or not turning.issuperset(weights)
+        per_radian = turning if is_length else ()
+        rows.append((row.name, format_sum(weights, per_radian, length)))
     caption = "Sums: what the transmission of a reading gives"
     if couplings:
         caption = "Sums: what readings give, and what couplings hold"
@@ -119,12 +121,16 @@ def _build_sum_table(robot: Mechanism) -> Table:
     return make_table(caption, (title, word_column("sum of joint values", wraps=True)), rows)
 
 
-def format_sum(weights: Mapping[str, float]) -> str:
-    """Return a weighted sum as text, such as `m + 2 k`."""
+def format_sum(weights: Mapping[str, float], per_radian: Collection[str | None], unit: Unit) -> str:
+    """Return a weighted sum as text, such as `m + 2 k + 12 mm/rad pin`, where weights of some
+    joints are lengths per radian.
+    """
     text = ""
     for name, weight in weights.items():
         if weight:
             size = "" if abs(weight) == 1.0 else f"{format_number(abs(weight), DIGITS)} "
+            if name in per_radian:
+                size = f"{format_number(abs(weight) / unit.factor_to_si, DIGITS)} {unit}/rad "
             sign = " - " if weight < 0.0 else " + "
             text += f"{sign if text else sign.strip(' +')}{size}{name}"
     return text

@@ -465,7 +465,9 @@ def test_a_singular_start_is_refused_with_the_start_values_of_home(tmp_path: Pat
     """Legs of a 3-UPU that begin upright lean by arctan(150 / 500) at home."""
     with pytest.raises(MechanismError) as refusal:
         load_text(tmp_path, UPU)
-    assert "Enter values near home: leg1.low.1 -16.7 deg, leg1.slide 522 mm" in str(refusal.value)
+    # the values of one of three equal legs, all of them
+    values = "leg1.low.1 -16.7 deg, leg1.slide 522 mm and leg1.up.2 16.7 deg"
+    assert str(refusal.value).endswith(f"Enter values near home: {values}.")
     leaning = UPU.replace("axes: [y, x]", "axes: [y, x], start: [-16.7, 0]").replace(
         "axes: [x, y]", "axes: [x, y], start: [0, 16.7]"
     )

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from loopcal.apply.inspection import inspect_robot
 from loopcal.errors import FileError, MechanismError
 from loopcal.estimate.identification import identify
 from loopcal.estimate.options import FitOptions
@@ -19,9 +20,12 @@ from loopcal.measure.simulation import sample_truth, simulate
 from loopcal.mechanism.actuation import differentiate_at_pose, solve_at_pose
 from loopcal.mechanism.chains import select_entries
 from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.over_constraint import find_over_constraint
 from loopcal.mechanism.singularities import analyze_singularity
 from loopcal.mechanism.solutions import forward, inverse, jacobian
 from loopcal.mechanism.workspace import sample_workspace
+from loopcal.report.robot_view import view_robot
+from loopcal.results.tables import Table
 
 ATOL = 1e-9  # [m, rad]: Newton stops below 1e-13 of the size; the rest is the condition
 POSES = 100
@@ -484,3 +488,66 @@ limbs:
     assert_allclose(solution.residual, 2e-3 * robot.size, rtol=1e-3)  # four times a mrad
     assert "mrad" in repr(solution)
     assert "mrad" in str(robot.describe_gap(solution.residual[0]))
+
+
+# A delta whose parallelograms turn on pins about upper and lower cross bars (3-RRPaR).
+CROSS_BARS = """
+format: 1
+family: limbs
+name: cross-bars
+units: {length: mm, angle: deg}
+freedoms: [x, y, z]
+controlled: [x, y, z]
+bodies: [{name: upper, copies: {count: 3}}, {name: lower, copies: {count: 3}}]
+drives: {q: {reads: angle, stroke: [-30, 80], unknown: [offset, gain], angle: {sd: 0.2}}}
+limbs:
+  - name: arm
+    to: upper
+    ending: rigid
+    copies: {count: 3}
+    chain:
+      - {joint: R, name: motor, at: [150, 0, 0], axis: y, actuated: q, start: 20}
+      - {joint: R, name: elbow, at: [200, 0, 0], axis: y, start: 80}
+  - name: left
+    on: upper
+    to: lower
+    ending: rigid
+    copies: {count: 3}
+    chain: [{joint: R, name: top, at: [0, 40, 0]}, {joint: R, name: bottom, at: [450, 0, 0]}]
+    attach: [0, 40, 0]
+  - {name: right, on: upper, to: lower, tip: [0, -40, 0], attach: [0, -40, 0], ending: distance,
+     length: 450, copies: {count: 3}}
+  - {name: foot, on: lower, ending: rigid, copies: {count: 3}, attach: [60, 0, 0],
+     chain: [{joint: R, name: pin, axis: y, start: -100}]}
+home: {z: -450}
+workspace: {x: [-100, 100], y: [-100, 100], z: [-500, -420]}
+"""
+
+
+def test_bars_between_pins_are_rods_of_a_delta(tmp_path: Path) -> None:
+    nominal = load(CROSS_BARS, tmp_path)
+    robot = nominal.with_values(sample_truth(nominal, 1, seed=5)[0])
+    value = dict(zip(robot.parameters.names, robot.values, strict=True))
+    reached = inverse(robot, sample_workspace(nominal, POSES, 3).coordinates)
+    T = forward(robot, reached.q).T
+    for i, turn in enumerate(np.exp(2j * np.pi / 3 * np.arange(3))):
+        angle = value[f"q{i + 1}.gain"] * reached.q[:, i] + value[f"q{i + 1}.offset"]
+        apart = T[:, 0, 3] + 1j * T[:, 1, 3] - (0.15 + 0.2 * np.cos(angle) - 0.06) * turn
+        assert_allclose(np.hypot(abs(apart), T[:, 2, 3] + 0.2 * np.sin(angle)), 0.45, atol=ATOL)
+    # lower bars cannot turn about their rods or upright: platform and parallelogram prevent it
+    finding = find_over_constraint(nominal)
+    assert finding is not None
+    repeated = finding.data["repeated"]
+    for i, entry in enumerate(repeated, start=1):
+        others = (f"arm{i}", f"left{i}", f"right{i}")
+        assert (entry["limb"], entry["others"]) == (f"foot{i}", others)
+        assert [direction["turns"] for direction in entry["directions"]] == [True, True]
+    assert len(repeated) == 3
+
+
+def test_weights_of_turning_joints_in_a_length_are_shown_per_radian(tmp_path: Path) -> None:
+    page = view_robot(
+        inspect_robot(load(WINCHES.replace("pulley: -40}", "pulley: -40.5}"), tmp_path))
+    )
+    sums = next(block for block in page if isinstance(block, Table) and "Sums" in block.caption)
+    assert ("pay1", "w1 - cable1.wire - 40.5 mm/rad cable1.pulley") in sums.rows

@@ -137,6 +137,13 @@ def test_wrong_shapes_of_readings_and_targets_are_refused():
         inverse(zoo.delta(), np.zeros((2, 5)))
 
 
+def test_a_start_that_is_no_solution_is_refused():
+    robot = load_cached_robot("five-bar")
+    for solve in (forward, inverse):
+        with pytest.raises(DataError, match="start is of type ndarray"):
+            solve(robot, np.zeros((1, 2)), start=robot.home)  # type: ignore[arg-type]
+
+
 def test_start_selects_the_assembly_mode():
     robot = zoo.delta()
     sol = forward(robot, np.full((1, 3), 0.2))

@@ -84,7 +84,8 @@ class LinearDelta(RobotRecord):
 
     radius : horizontal distance of a rod's ends with the nozzle in the center [m].
     angles : of the towers [rad]; the third one defines the base frame's x axis and is fixed.
-    arms : lengths of the rods [m], one or three. stops : end-stop heights [m], one or three.
+    arms : lengths of the rods [m], one or three.
+    stops : heights of the nozzle in the center at reading zero [m], one or three.
     readings : `drop` below the end stop or `height` above the lowest carriage position. stroke :
         allowed readings [m].
     stored_parameters : by default what firmware of printers calibrates: radius, angles, stops.
