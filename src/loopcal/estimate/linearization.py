@@ -385,7 +385,7 @@ def _write_parameter_columns(
     if count := _count_rows_of_poses(rows, D.shape[1]):
         n, height = D.shape[1], count * machine.shape[2]
         by_twist = by_twist.reshape(len(by_twist), n, height, 6)
-        product = machine.reshape(len(machine), n, height, -1)[..., :-1]
+        product = machine.reshape(len(machine), n, height, machine.shape[-1])[..., :-1]
     else:
         D = D[:, rows.poses]
     # one order of the products for any number of trials: each trial equals its own fit bit for bit
