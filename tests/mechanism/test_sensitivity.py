@@ -16,15 +16,7 @@ from loopcal.mechanism.compilation import build
 from loopcal.mechanism.kinematics import compute_readings, forward_trials
 from loopcal.mechanism.sensitivity import differentiate_passive_joints, differentiate_pose
 from loopcal.mechanism.solutions import forward, make_solution
-from loopcal.mechanism.transmission import (
-    TERMS,
-    joint_slopes,
-    joints_from_readings,
-    list_constants,
-    nominal_terms,
-    readings_from_joints,
-    term_derivatives,
-)
+from loopcal.mechanism.transmission import TERMS, Transmissions, list_constants, nominal_terms
 from loopcal.parameters import Parameter
 from loopcal.units import Dimension
 from tests import zoo
@@ -268,8 +260,8 @@ def test_displacement_jacobian_agrees_with_differences(name):
     values = robot.values + np.random.default_rng(1).normal(size=(2, len(robot.parameters))) * 1e-3
 
     def slots(x):
-        e, tau = robot.slots(values + x)
-        return np.concatenate([e, tau.reshape(2, -1)], axis=1)
+        e, drives = robot.slots(values + x)
+        return np.concatenate([e, drives.tau.reshape(2, -1)], axis=1)
 
     scale = np.array(
         [
@@ -296,18 +288,19 @@ def test_shared_map_jacobian_of_a_delta_agrees_with_differences():
 
 def test_nominal_values_give_zero_displacements():
     for robot in (zoo.hexapod(), zoo.delta(), zoo.mixed_hexapod()):
-        e, tau = robot.slots(robot.values[None])
+        e, drives = robot.slots(robot.values[None])
         assert_array_equal(e, 0.0)
-        assert_array_equal(tau, nominal_terms(robot.actuators)[None])
+        assert_array_equal(drives.tau, nominal_terms(robot.actuators)[None])
 
 
 def test_maps_of_stacked_trials_equal_single_trials_bit_for_bit():
     robot = zoo.delta()
     values = robot.values + np.random.default_rng(1).normal(size=(7, len(robot.parameters))) * 1e-3
-    together = robot.slots(values)
+    e, drives = robot.slots(values)
     for i in range(7):
-        for a, b in zip(together, robot.slots(values[i : i + 1]), strict=True):
-            assert_array_equal(a[i], b[0])
+        own, own_drives = robot.slots(values[i : i + 1])
+        assert_array_equal(e[i], own[0])
+        assert_array_equal(drives.tau[i], own_drives.tau[0])
 
 
 FIRST = {"offset": 0.1, "gain": 1.001, "sin1": 2e-5, "cos1": -1e-5, "sin2": 5e-6, "cos2": 3e-6}
@@ -323,16 +316,20 @@ READINGS = np.random.default_rng(4).uniform(-0.1, 0.1, (1, 6, 3))
 
 def test_transmission_derivatives_agree_with_differences():
     tau, w = nominal_terms(ACTUATORS)[None], list_constants(ACTUATORS)
+    drives = Transmissions(tau, w)
     check_jacobian(
-        lambda x: joints_from_readings(READINGS + x[0], tau, w), joint_slopes(READINGS, tau, w)[..., None], np.zeros(1), scale=0.0005,  # noqa: E501
-        automatic=lambda x: joints_from_readings(READINGS + x[0], tau, w),
-    )  # fmt: skip
+        lambda x: drives.find_joints(READINGS + x[0]),
+        drives.differentiate(READINGS)[..., None],
+        np.zeros(1),
+        scale=0.0005,
+        automatic=lambda x: drives.find_joints(READINGS + x[0]),
+    )
     for i in range(len(TERMS)):
         unit = np.zeros_like(tau)
         unit[..., i] = 1.0
-        column = term_derivatives(READINGS, tau, w)[i]
+        column = drives.differentiate_terms(READINGS)[i]
         check_jacobian(
-            lambda x, u=unit: joints_from_readings(READINGS, tau + x[0] * u, w),
+            lambda x, u=unit: Transmissions(tau + x[0] * u, w).find_joints(READINGS),
             column[..., None],
             np.zeros(1),
             scale=1.0,
@@ -342,17 +339,15 @@ def test_transmission_derivatives_agree_with_differences():
 
 
 def test_transmission_round_trips_to_rounding():
-    tau, w = nominal_terms(ACTUATORS)[None], list_constants(ACTUATORS)
+    drives = Transmissions(nominal_terms(ACTUATORS)[None], list_constants(ACTUATORS))
     assert_allclose(
-        readings_from_joints(joints_from_readings(READINGS, tau, w), tau, w),
-        READINGS,
-        rtol=0,
-        atol=1e-16 / 0.9 * 10,
+        drives.find_readings(drives.find_joints(READINGS)), READINGS, rtol=0, atol=1e-16 / 0.9 * 10
     )
 
 
 def test_actuator_without_period_has_no_harmonics():
-    columns = term_derivatives(READINGS, nominal_terms(ACTUATORS)[None], list_constants(ACTUATORS))
+    drives = Transmissions(nominal_terms(ACTUATORS)[None], list_constants(ACTUATORS))
+    columns = drives.differentiate_terms(READINGS)
     for term, column in zip(TERMS, columns, strict=True):
         if term.startswith(("sin", "cos")):
             assert_array_equal(column[..., 1], 0.0)

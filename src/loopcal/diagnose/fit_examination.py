@@ -39,7 +39,7 @@ from loopcal.findings import Finding, report_finding
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations
 from loopcal.mechanism.model import Mechanism
-from loopcal.mechanism.transmission import SOURCE, find_fixed_rows, transmit_readings
+from loopcal.mechanism.transmission import SOURCE
 from loopcal.numerics.elimination import find_connected_groups
 from loopcal.numerics.statistics import compute_f_tail, find_distinct
 from loopcal.plain_text import represent
@@ -280,12 +280,11 @@ def compute_reading_errors(
     recorded = data.readings
     compared = np.isfinite(sigma) & (sigma > 0.0) & np.isfinite(recorded) & np.isfinite(estimated)
     reading = np.where(compared, recorded - estimated, np.nan)
-    _, tau = robot.slots(robot.values[None])
+    _, drives = robot.slots(robot.values[None])
     # values of the driven joints, or of their sums; a condition has none
-    constants, joint = robot.slots.constants, np.full_like(reading, np.nan)
-    own = ~find_fixed_rows(constants)
-    values = [transmit_readings(q[None], tau, constants)[0][:, own] for q in (recorded, estimated)]
-    joint[:, constants[own, SOURCE].astype(int)] = values[0] - values[1]
+    own, joint = ~drives.fixed_rows, np.full_like(reading, np.nan)
+    values = [drives.transmit(q[None])[0][:, own] for q in (recorded, estimated)]
+    joint[:, drives.constants[own, SOURCE].astype(int)] = values[0] - values[1]
     joint[~compared] = np.nan
     limbs = robot.assembly.limbs
     turning = {joint.actuator for limb in limbs for joint in limb.joints if joint.kind == "R"}

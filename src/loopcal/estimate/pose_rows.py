@@ -328,8 +328,8 @@ class PoseRows:
 
         def move(z: FloatArray) -> tuple[FloatArray, FloatArray, engine.ParameterMap]:
             values = self.free.values(z[None])
-            e, tau, joints = drive_joints(robot, values, q)
-            return e, joints, columns.linearize(values, tau, q)
+            e, drives, joints = drive_joints(robot, values, q)
+            return e, joints, columns.linearize(values, drives, q)
 
         own = steps._replace(deviation=z[0], widest=WIDE * robot.size, move=move)
         (e, joints, inputs), factor = move(z[0]), empty_factor(1, z.shape[1])

@@ -21,19 +21,7 @@ from loopcal.mechanism.limb_rows import (
 )
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.states import driven_values
-from loopcal.mechanism.transmission import (
-    apply_weights,
-    differentiate_by_readings,
-    differentiate_sums,
-    evaluate_references,
-    find_fixed_rows,
-    invert_weights,
-    joints_from_readings,
-    readings_from_joints,
-    select_weights,
-    term_derivatives,
-    transmit_readings,
-)
+from loopcal.mechanism.transmission import Transmissions, apply_weights, invert_weights
 from loopcal.numerics.trial_batch import map_arrays
 from loopcal.typing import FloatArray, IntArray
 
@@ -46,21 +34,21 @@ class Derivatives(NamedTuple):
 
 
 class DrivenJoints(NamedTuple):
-    """Displacements e (t | 1, d) [m, rad], terms tau (t | 1, a, k) of the transmissions, and values
-    (t | 1, n, J) of the driven joints [m, rad] of a robot of one stage.
+    """Displacements e (t | 1, d) [m, rad], the transmissions, and values (t | 1, n, J) of the
+    driven joints [m, rad] of a robot of one stage.
     """
 
     e: FloatArray
-    tau: FloatArray
+    drives: Transmissions
     joints: FloatArray
 
 
 def drive_joints(robot: Mechanism, values: FloatArray, q: FloatArray) -> DrivenJoints:
     """Return displacements and driven joints for values (t | 1, p) and readings q (t | 1, n, a)."""
-    e, tau = robot.slots(values)
+    e, drives = robot.slots(values)
     with np.errstate(invalid="ignore"):
         # an infinite reading turns into NaN, and the engine marks its row
-        return DrivenJoints(e, tau, joints_from_readings(q, tau, robot.slots.constants))
+        return DrivenJoints(e, drives, drives.find_joints(q))
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,13 +92,13 @@ def list_open_sums(
     """Return the sums for values (t | 1, p); places : of the readings that choose sums, default
     all. q : readings (t | 1, n, a) of conditions, which have their references without them.
     """
-    (_, tau), constants = robot.slots(values), robot.slots.constants
-    count, weights = int((~find_fixed_rows(constants)).sum()), select_weights(tau, constants)
+    _, drives = robot.slots(values)
+    count, weights = int((~drives.fixed_rows).sum()), drives.weights
     if weights is None:
         weights = np.eye(robot.program.n_joints)[None]
     chosen = np.arange(count) if places is None else places
     own = weights[:, [*chosen, *range(count, weights.shape[1])]]
-    at = evaluate_references(tau, constants) if q is None else transmit_readings(q, tau, constants)
+    at = drives.evaluate_references() if q is None else drives.transmit(q)
     return OpenSums(chosen, at[..., count:], own)
 
 
@@ -142,15 +130,14 @@ def solve_at_pose(
     begin : (t, n), whose joints select the branch of each limb. q : (t | 1, n, a) readings, of
     which only the conditions count; these have their references without them.
     """
-    (e, tau), sums = robot.slots(values), None
+    (e, drives), sums = robot.slots(values), None
     guess, limbs = driven_values(robot.program, begin), robot.program.with_fixed_platform
     if robot.assembly.couplings:
         own = list_open_sums(robot, values, q=q)
         sums = scale_sums(robot, own.weights[:, own.chosen :], own.fixed)
     begin = replace(begin, T=T)
     state = engine.solve(limbs, e, guess, begin, free=sums is None, sums=sums)
-    joints = driven_values(robot.program, state)
-    closed = readings_from_joints(joints, tau, robot.slots.constants)
+    closed = drives.find_readings(driven_values(robot.program, state))
     return state, closed if q is None else keep_conditions(robot, closed, q)
 
 
@@ -306,18 +293,18 @@ def _differentiate_sums(
     """Return the weights (t | 1, 1, a, J), and the derivatives of s - W l at constant lengths l
     (t, n, J); without sums each reading has its own joint.
     """
-    slots, (_, tau) = robot.slots, robot.slots(values)
-    weights = select_weights(tau, slots.constants)
+    slots, (_, drives) = robot.slots, robot.slots(values)
+    weights = drives.weights
     of_terms = slots.jacobian(values)[:, slots.n_displacements :]
     of_terms = of_terms.reshape(len(of_terms), *slots.terms.shape, -1)
     with np.errstate(invalid="ignore"):  # as in `drive_joints`
         if weights is None:
-            by_terms = np.stack(term_derivatives(q, tau, slots.constants), axis=3)
+            by_terms = np.stack(drives.differentiate_terms(q), axis=3)
             weights = np.eye(robot.program.n_joints)[None]
         else:
-            by_terms = differentiate_sums(q, tau, slots.constants, lengths)
+            by_terms = drives.differentiate_sums(q, lengths)
         by_parameters = np.moveaxis(np.matmul(np.moveaxis(by_terms, 2, 1), of_terms), 1, 2)
-        by_readings = differentiate_by_readings(q, tau, slots.constants)
+        by_readings = drives.differentiate_by_readings(q)
     lead = np.broadcast_shapes(*(a.shape[:2] for a in (by_parameters, by_readings, lengths)))
     both = (np.broadcast_to(a, (*lead, *a.shape[2:])) for a in (by_parameters, by_readings))
     return weights[:, None], Derivatives(*both)

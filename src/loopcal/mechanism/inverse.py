@@ -36,15 +36,7 @@ from loopcal.mechanism.platform_coordinates import (
 )
 from loopcal.mechanism.sensitivity import differentiate_by_drives
 from loopcal.mechanism.states import Status, driven_values, put_poses, without_poses
-from loopcal.mechanism.transmission import (
-    apply_weights,
-    find_fixed_rows,
-    find_reversed,
-    find_triangles,
-    joints_from_readings,
-    select_weights,
-    transmit_readings,
-)
+from loopcal.mechanism.transmission import Transmissions, apply_weights
 from loopcal.numerics.gauss_newton import ROUNDING as ROUNDED
 from loopcal.numerics.trial_batch import TrialBatch, map_arrays
 from loopcal.typing import BoolArray, FloatArray, IntArray
@@ -218,7 +210,7 @@ class _Rows:
     e: tuple[FloatArray, ...]
     links: tuple[tuple[FloatArray, FloatArray] | None, ...]
     sums: tuple[OpenSums | None, ...]
-    terms: tuple[FloatArray, ...]
+    drives: tuple[Transmissions, ...]
     sign: FloatArray
     turns: BoolArray
     spans: FloatArray
@@ -317,16 +309,16 @@ class _Rows:
         the dead center of a triangle drive.
         """
         beyond = (now.sign != self.sign) & (self.sign != 0.0)
-        for stage, tau in zip(self.robot.blocks, self.terms, strict=True):
-            triangles, chosen = find_triangles(tau), stage.robot.determining_readings
+        for stage, drives in zip(self.robot.blocks, self.drives, strict=True):
+            triangles, chosen = drives.triangles, stage.robot.determining_readings
             if chosen is not None:
                 triangles = np.intersect1d(triangles, chosen)
             if len(triangles):
                 u = _select_drives(stage, now.u)
-                weights = select_weights(tau, stage.robot.slots.constants)
+                weights = drives.weights
                 if weights is not None and weights.shape[2] == u.shape[2]:
                     u = apply_weights(weights, u)
-                beyond |= find_reversed(u, tau, triangles)[:, 0].any(axis=1)
+                beyond |= drives.find_reversed(u, triangles)[:, 0].any(axis=1)
         return beyond
 
     def iterate(self, start: _Iterate, on_path: bool = False) -> _Iterate:
@@ -452,7 +444,7 @@ def _solve_by_drives(
 
 def _make_rows(robot: Mechanism, values: FloatArray, target: FloatArray) -> _Rows:
     """Return rows with values (1 | R, p) and targets (R, c)."""
-    slots, links, sums, turns = list[tuple[FloatArray, ...]](), [], [], list[bool]()
+    slots, links, sums, turns = list[tuple[FloatArray, Transmissions]](), [], [], list[bool]()
     robot = robot.exact
     for stage in robot.blocks:
         own, assembly = values[:, stage.parameters], stage.robot.assembly
@@ -469,7 +461,7 @@ def _make_rows(robot: Mechanism, values: FloatArray, target: FloatArray) -> _Row
             drives = [actuator.driven_joints for actuator in assembly.actuators]
         drives += [()] * (len(assembly.actuators) - len(drives))  # conditions
         turns += [not assembly.turning_drives.isdisjoint(names) for names in drives]
-    e, terms = zip(*slots, strict=True)
+    e, transmissions = zip(*slots, strict=True)
     return _Rows(
         robot,
         values,
@@ -477,7 +469,7 @@ def _make_rows(robot: Mechanism, values: FloatArray, target: FloatArray) -> _Row
         e,
         tuple(links),
         tuple(sums),
-        terms,
+        transmissions,
         np.zeros(len(target)),
         np.array(turns),
         measure_spans(robot, np.array(turns)),
@@ -489,14 +481,13 @@ def measure_spans(robot: Mechanism, turns: BoolArray) -> FloatArray:
     """Return the `spans` of the drives (u,) of a robot."""
     spans = np.where(turns, 2 * np.pi, robot.size)
     if has_spare_drives(robot):
-        _, tau = robot.slots(robot.values[None])
+        _, drives = robot.slots(robot.values[None])
         at_rest = ((np.nan if a.reference is None else a.reference,) * 2 for a in robot.actuators)
         strokes = np.array([a.stroke or e for a, e in zip(robot.actuators, at_rest, strict=True)])
         # else readings are open sums
         has_all = robot.is_commanded.sum() == robot.program.n_joints
-        convert = joints_from_readings if has_all else transmit_readings
-        constants = robot.slots.constants
-        ends = convert(strokes.T[None], tau, constants)[0][:, ~find_fixed_rows(constants)]
+        convert = drives.find_joints if has_all else drives.transmit
+        ends = convert(strokes.T[None])[0][:, ~drives.fixed_rows]
         stated = np.full(len(turns), np.nan)
         stated[robot.is_commanded] = np.abs(ends[1] - ends[0])
         spans = np.where(stated > 0.0, stated, spans)

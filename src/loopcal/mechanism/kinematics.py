@@ -23,21 +23,7 @@ from loopcal.mechanism.limb_rows import follow_limb, follow_links, place_serial
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.sensitivity import differentiate_pose
 from loopcal.mechanism.states import Status, driven_values, list_bodies, replace_rows, without_poses
-from loopcal.mechanism.transmission import (
-    ALL_TERMS,
-    LOADED,
-    SOURCE,
-    TERMS,
-    apply_weights,
-    evaluate_slopes,
-    find_triangles,
-    invert_weights,
-    measure_excess,
-    readings_from_joints,
-    select_weights,
-    transmit_readings,
-    turn_head,
-)
+from loopcal.mechanism.transmission import LOADED, SOURCE, apply_weights, invert_weights, turn_head
 from loopcal.numerics.trial_batch import map_arrays
 from loopcal.typing import BoolArray, FloatArray
 
@@ -99,9 +85,8 @@ class Loops(NamedTuple):
     @classmethod
     def place(cls, robot: Mechanism, values: FloatArray) -> Loops:
         """Return the loops for parameter values (t | 1, p), of a robot without stages."""
-        e, tau = robot.slots(values)
-        open_sums = select_weights(tau, robot.slots.constants) if robot.has_open_sums else None
-        return cls(robot, e, open_sums)
+        e, drives = robot.slots(values)
+        return cls(robot, e, drives.weights if robot.has_open_sums else None)
 
     def solve(
         self,
@@ -174,9 +159,9 @@ def drive_loops(
     `drive_joints`, where it is known.
     """
     if robot.has_open_sums:
-        _, tau = robot.slots(values)
+        e, drives = robot.slots(values)
         with np.errstate(invalid="ignore"):  # as in `drive_joints`
-            return Loops.place(robot, values), transmit_readings(q, tau, robot.slots.constants)
+            return Loops(robot, e, drives.weights), drives.transmit(q)
     e, _, joints = driven or drive_joints(robot, values, q)
     return Loops(robot, e, None), joints
 
@@ -275,11 +260,10 @@ def forward_trials(
         return join_stage_states(robot, states)
     loops, joints = drive_loops(robot, values, q, driven)
     state = loops.close(joints, start, follow)
-    if not len(find_triangles(robot.slots.terms[None])):
+    if not any(actuator.is_triangle for actuator in robot.assembly.rows):
         return state
-    _, tau = robot.slots(values)
     # a length of a triangle that no angle reaches
-    excess = np.broadcast_to(measure_excess(q, tau, robot.slots.constants), state.status.shape)
+    excess = np.broadcast_to(robot.slots(values)[1].measure_excess(q), state.status.shape)
     is_beyond = (state.status == Status.NOT_FINITE.value) & (excess > 0.0) & np.isfinite(excess)
     return replace(
         state,
@@ -336,14 +320,13 @@ def compute_closure_sign(robot: Mechanism, values: FloatArray, state: State) -> 
 
 def compute_readings(robot: Mechanism, values: FloatArray, state: State) -> FloatArray:
     """Return the readings (t, n, a) of a state."""
-    _, tau = robot.slots(values)
+    _, drives = robot.slots(values)
     joints = driven_values(robot.program, state)
-    q = readings_from_joints(joints, tau, robot.slots.constants)
+    q = drives.find_readings(joints)
     wrench = np.array(robot.assembly.load.wrench)
     if not (robot.is_elastic and wrench.any()):
         return q
-    loads = compute_loads(robot, values, q, state, wrench)
-    return readings_from_joints(joints, tau, robot.slots.constants, loads)
+    return drives.find_readings(joints, compute_loads(robot, values, q, state, wrench))
 
 
 def compute_loads(
@@ -364,10 +347,9 @@ def compute_loads(
     moment, force = np.broadcast_arrays(moment + np.cross(arm, force), force)
     twists = differentiate_pose(robot, values, q, state).readings
     power = np.matmul(np.concatenate([moment, force], axis=-1)[..., None, :], twists)[..., 0, :]
-    constants = robot.slots.constants
-    slopes = evaluate_slopes(q, robot.slots(values)[1], constants)
+    _, drives = robot.slots(values)
     with np.errstate(divide="ignore", invalid="ignore"):  # couplings have no reading
-        return power[..., constants[:, SOURCE].astype(int)] / slopes
+        return power[..., drives.constants[:, SOURCE].astype(int)] / drives.evaluate_slopes(q)
 
 
 def load_readings(
@@ -441,14 +423,14 @@ def locate_anchors(robot: Mechanism, state: State) -> tuple[Anchors, ...]:
     place = {name: i for i, name in enumerate(robot.assembly.driven_joints)}
     if not column:
         return ()
-    _, tau = robot.slots(robot.values[None])
+    _, drives = robot.slots(robot.values[None])
     angles = driven_values(robot.program, state)[0]
     frames = compute_limb_frames(robot, robot.values[None], state)
     located = []
     for i, limb in enumerate(robot.assembly.limbs):
         for j, joint in enumerate(limb.joints):
             if joint.actuator in column:
-                triangle = tau[0, column[joint.actuator], len(TERMS) : len(ALL_TERMS)]
+                triangle = drives.list_triangle_terms(column[joint.actuator])[0, 0]
                 head = turn_head(angles[:, place[joint.actuator]], triangle)
                 foot = np.broadcast_to(triangle[:3], head.shape)
                 own, T = np.stack([foot, head], axis=1), frames[i][0, :, j]

@@ -32,7 +32,6 @@ from loopcal.mechanism.platform_coordinates import (
     differentiate_coordinates,
 )
 from loopcal.mechanism.states import driven_values
-from loopcal.mechanism.transmission import select_weights
 from loopcal.numerics.decomposition import find_null_space
 from loopcal.typing import FloatArray
 from loopcal.units import SI_SYMBOLS, Dimension
@@ -132,8 +131,7 @@ def _check_open_sums(robot: Mechanism, rows: FloatArray) -> bool:
     """Return whether the sums are more than the freedoms at home, where they contradict each other
     by their errors, for closure rows (c, M + J). Refuse sums that leave the platform free.
     """
-    _, tau = robot.slots(robot.values[None])
-    weights = select_weights(tau, robot.slots.constants)
+    weights = robot.slots(robot.values[None])[1].weights
     assert weights is not None
     units = measure_sums(robot, weights)[:, None]
     sums = np.pad(weights[0] * units, [(0, 0), (rows.shape[1] - weights.shape[2], 0)])

@@ -21,13 +21,8 @@ from loopcal.mechanism.transmission import (
     LOADED,
     REFERENCE,
     SOURCE,
-    differentiate_sums,
-    find_triangles,
+    Transmissions,
     invert_weights,
-    joint_slopes,
-    joints_from_readings,
-    select_weights,
-    term_derivatives,
 )
 from loopcal.parameters import ParameterTable
 from loopcal.results.description import Field, label_axes
@@ -58,10 +53,10 @@ class ParameterUnits:
     places: IntArray
     units: FloatArray
 
-    def linearize(self, values: FloatArray, tau: FloatArray, q: FloatArray) -> ParameterMap:
+    def linearize(self, values: FloatArray, drives: Transmissions, q: FloatArray) -> ParameterMap:
         """Return how these parameters and the readings move displacements and joint values.
 
-        values : (t | 1, all). tau : (t | 1, a, k) their terms. q : (t | 1, n, a) readings.
+        values : (t | 1, all). drives : theirs. q : (t | 1, n, a) readings.
         """
         slots, pattern = self.slots, self.slots.moved_by(self.places).pattern
         cut = len(pattern.displacements)
@@ -71,27 +66,27 @@ class ParameterUnits:
             slopes = slots.jacobian(values)[:, of_slots, of_columns] * units
         # with summed drives one for each joint, so that derivatives by readings are those by joints
         by_readings = (
-            joint_slopes(q, tau, slots.constants)
-            if (weights := select_weights(tau, self.slots.constants)) is None
+            drives.differentiate(q)
+            if (weights := drives.weights) is None
             else np.ones((1, 1, weights.shape[-1]))
         )
         return ParameterMap(
-            pattern, slopes[:, :cut], slopes[:, cut:], self._evaluate_terms(q, tau), by_readings
+            pattern, slopes[:, :cut], slopes[:, cut:], self._evaluate_terms(q, drives), by_readings
         )
 
-    def _evaluate_terms(self, q: FloatArray, tau: FloatArray) -> FloatArray:
+    def _evaluate_terms(self, q: FloatArray, drives: Transmissions) -> FloatArray:
         """Return what the moved transmission terms contribute, (t | 1, n | 1, a, terms)."""
-        w, terms = self.slots.constants, self.slots.moved_by(self.places).terms
-        if (weights := select_weights(tau, self.slots.constants)) is not None:
-            actuators, numbers = np.divmod(np.array(terms, np.int64), tau.shape[-1])
-            slopes = differentiate_sums(q, tau, w, joints_from_readings(q, tau, w))
+        terms = self.slots.moved_by(self.places).terms
+        if (weights := drives.weights) is not None:
+            actuators, numbers = np.divmod(np.array(terms, np.int64), drives.tau.shape[-1])
+            slopes = drives.differentiate_sums(q, drives.find_joints(q))
             inverse = invert_weights(weights)[:, None][..., actuators]
             return inverse * slopes[:, :, None, actuators, numbers]
-        has_offsets_only = not any(terms) and not len(find_triangles(tau))
+        has_offsets_only = not any(terms) and not len(drives.triangles)
         if not terms or has_offsets_only:
             # offsets are the same for all poses
-            return np.ones((1, 1, len(w), len(terms)))
-        return np.stack(term_derivatives(q, tau, w, terms), axis=-1)
+            return np.ones((1, 1, len(drives.constants), len(terms)))
+        return np.stack(drives.differentiate_terms(q, terms), axis=-1)
 
     def select(self, by_all: FloatArray) -> FloatArray:
         """Return derivatives (.., p + a) by these parameters and what follows, of those by all
@@ -118,7 +113,7 @@ SHOWN_ACTUATORS = 8  # actuators that `repr` names before it counts the others
 
 @dataclass(frozen=True, eq=False)
 class SlotMap:
-    """Map of parameter values onto displacements e and transmission terms tau.
+    """Map of parameter values onto displacements e and transmissions.
 
     slots(v) = M (v - nominal) + sum over shared maps of [g(v) - g(nominal)]. The first
     `n_displacements` slots are e, the others the terms of the actuators, (a, k) row by row, with
@@ -138,8 +133,8 @@ class SlotMap:
     terms: FloatArray
     constants: FloatArray
 
-    def __call__(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return e (t, n_displacements) and tau (t, a, k) of values (t, p)."""
+    def __call__(self, values: FloatArray) -> tuple[FloatArray, Transmissions]:
+        """Return e (t, n_displacements) and the transmissions of values (t, p)."""
         slots = np.zeros((len(values), len(self.matrix)))
         change = values - self.nominal
         # element by element, so that a trial's result does not depend on its neighbors
@@ -148,7 +143,7 @@ class SlotMap:
         for shared, inputs, outputs, nominal in self._together:
             slots[:, outputs] += shared.value(values[:, inputs]) - nominal
         e, tau = slots[:, : self.n_displacements], slots[:, self.n_displacements :]
-        return e, self.terms + tau.reshape(-1, *self.terms.shape)
+        return e, Transmissions(self.terms + tau.reshape(-1, *self.terms.shape), self.constants)
 
     @cached_property
     def _layers(self) -> list[tuple[IntArray, IntArray, FloatArray]]:
@@ -199,7 +194,7 @@ class SlotMap:
         slot, column = np.nonzero(touches)
         cut = int(np.searchsorted(slot, self.n_displacements))
         joint, term = np.divmod(slot[cut:] - self.n_displacements, self.terms.shape[1])
-        weights = select_weights(self.terms, self.constants)
+        weights = Transmissions(self.terms, self.constants).weights
         if weights is not None:  # once for each joint in sums
             n = weights.shape[-1]
             term = np.tile(slot[cut:] - self.n_displacements, n)

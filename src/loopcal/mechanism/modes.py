@@ -25,7 +25,6 @@ from loopcal.mechanism.kinematics import compute_readings, forward_trials
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.solutions import Solution, make_solution
 from loopcal.mechanism.states import Status, driven_values, join_states, make_start, select_poses
-from loopcal.mechanism.transmission import joints_from_readings
 from loopcal.results.result import Result
 from loopcal.typing import FloatArray, IntArray
 from loopcal.units import Dimension
@@ -179,8 +178,8 @@ def _subtract_turns(robot: Mechanism, state: State) -> State:
             for a in robot.actuators
         ]
     )
-    _, tau = robot.slots(robot.values[None])
-    center = joints_from_readings(middle[None, None], tau, robot.slots.constants)[0, 0]
+    _, drives = robot.slots(robot.values[None])
+    center = drives.find_joints(middle[None, None])[0, 0]
     driven = driven_values(robot.program, state)
     turns = np.round((driven - center) / (2 * np.pi))
     for group in robot.program.groups:

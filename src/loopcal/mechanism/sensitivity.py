@@ -63,9 +63,9 @@ def differentiate_pose(
         moved = chosen.select(differentiate_open_sums(robot, values, q, state))
         derivatives = np.split(spread_twists(robot.program, moved, nodes), [p], axis=3)
     else:
-        e, tau, joints = drive_joints(robot, values, q)
+        e, drives, joints = drive_joints(robot, values, q)
         with np.errstate(invalid="ignore"):  # as in `drive_joints`
-            inputs = chosen.linearize(values, tau, q)
+            inputs = chosen.linearize(values, drives, q)
             given = robot.program, e, joints, state, inputs, nodes
             by_parameters, turned = engine.differentiate(*given)
             if robot.has_sums:
@@ -160,8 +160,8 @@ def fold_pose_rows(
     `differentiate_pose`; see `engine.fold_poses`. For robots without stages whose readings
     determine the joints, and whose loops close.
     """
-    e, tau, joints = driven or drive_joints(robot, values, q)
-    inputs = columns.linearize(values, tau, q)
+    e, drives, joints = driven or drive_joints(robot, values, q)
+    inputs = columns.linearize(values, drives, q)
     return engine.fold_poses(factor, robot.program, e, joints, state, inputs, observed)
 
 

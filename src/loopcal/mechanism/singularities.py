@@ -34,12 +34,7 @@ from loopcal.mechanism.platform_coordinates import differentiate_coordinates
 from loopcal.mechanism.sensitivity import differentiate_pose
 from loopcal.mechanism.solutions import Solution, forward, inverse, make_solution
 from loopcal.mechanism.states import join_states
-from loopcal.mechanism.transmission import (
-    differentiate_by_readings,
-    find_fixed_rows,
-    invert_weights,
-    select_weights,
-)
+from loopcal.mechanism.transmission import invert_weights
 from loopcal.mechanism.workspace import sample_workspace
 from loopcal.numerics.statistics import compute_median
 from loopcal.results.result import Result
@@ -277,10 +272,9 @@ def _scale_closure(robot: Mechanism, state: State) -> tuple[FloatArray, FloatArr
     program, blocks = robot.program, linearize_state(robot, state)
     A, Q = (rows[0] for rows in reduce_to_platform(program, blocks))
     if robot.has_sums:
-        e, tau = robot.slots(robot.values[None])
-        weights = select_weights(tau, robot.slots.constants)
+        e, drives = robot.slots(robot.values[None])
+        weights, chosen = drives.weights, ~drives.fixed_rows  # sums of commanded readings
         assert weights is not None
-        chosen = ~find_fixed_rows(robot.slots.constants)  # sums of commanded readings
         if robot.has_open_sums:  # dy/ds^+ dy - ds = 0
             moved = differentiate_unknowns_by_sums(robot, e, state, weights)[0]
             A = np.linalg.pinv(
@@ -321,8 +315,8 @@ def _compute_chain_margins(
     D = differentiate_pose(robot, values, q, state).readings[0]
     columns = differentiate_coordinates(state.T[0], robot.controlled, robot.size)
     moving = find_carrying_actuators(robot)
-    tau = robot.slots(values)[1]
-    turned = np.abs(differentiate_by_readings(q, tau, robot.slots.constants)[0]).sum(axis=1)
+    _, drives = robot.slots(values)
+    turned = np.abs(drives.differentiate_by_readings(q)[0]).sum(axis=1)
     units = robot.drive_units * np.where(turned, turned, 1.0)  # of a reading
     slope = np.matmul(columns, D[..., moving]) / units[:, None, moving]
     good = np.isfinite(slope).all(axis=(1, 2))

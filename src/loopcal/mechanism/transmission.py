@@ -26,8 +26,9 @@ couplings may have the same one. Derivation: docs/theory/kinematics.md.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -217,11 +218,6 @@ of its load among the readings, -1 for none."""
 # Tables: a correction, or all of the motion of a cam, between points.
 
 
-def count_points(constants: FloatArray) -> int:
-    """Return the largest number K of points that a table of these drives has."""
-    return constants.shape[1] - FIXED
-
-
 @lru_cache
 def make_spline(points: bytes, is_cubic: bool) -> PPoly:
     """Return the weights of the values at points as functions of the reading: broken lines, or
@@ -234,22 +230,6 @@ def make_spline(points: bytes, is_cubic: bool) -> PPoly:
     if is_cubic:
         return CubicSpline(x, values, bc_type="natural")
     return PPoly(np.stack([np.diff(values, axis=0) / np.diff(x)[:, None], values[:-1]]), x)
-
-
-def _weigh_tables(r: FloatArray, constants: FloatArray, derivative: bool) -> FloatArray:
-    """Return the weights of the values of all tables at readings (t, n, a), (t, n, a, K), or their
-    derivatives by the reading. Outside its points a table is straight.
-    """
-    weights = np.zeros((*r.shape, count_points(constants)))
-    for a, row in enumerate(constants):
-        points = row[FIXED:][np.isfinite(row[FIXED:])]
-        if len(points):
-            spline, own = make_spline(points.tobytes(), bool(row[1])), r[..., a]
-            inside = np.where(np.isfinite(own), np.clip(own, points[0], points[-1]), points[0])
-            slope = spline(inside, 1)
-            chosen = slope if derivative else spline(inside) + slope * (own - inside)[..., None]
-            weights[..., a, : len(points)] = chosen
-    return weights
 
 
 def name_terms(actuators: Sequence[Actuator]) -> tuple[str, ...]:
@@ -306,296 +286,299 @@ def list_constants(
     return constants
 
 
-def find_fixed_rows(constants: FloatArray) -> BoolArray:
-    """Return which rows (a,) inverse kinematics cannot choose: those without a reading, and those
-    whose reading is never commanded.
+@dataclass(frozen=True, eq=False)
+class Transmissions:
+    """Terms tau (t | 1, a, k) of transmissions, and what no parameter changes, the constants (a,
+    5 + K) of `list_constants`.
     """
-    return (constants[:, SOURCE] < 0) | np.isfinite(constants[:, REFERENCE])
 
+    shared: ClassVar[tuple[str, ...]] = ("constants",)
 
-def evaluate_references(tau: FloatArray, constants: FloatArray) -> FloatArray:
-    """Return what the transmissions give (t | 1, 1, a) at the references of readings, and at zero
-    of those without one.
-    """
-    own = constants.copy()
-    own[:, SOURCE], own[:, LOADED] = np.arange(len(own)), -1
-    return evaluate_sums(np.nan_to_num(constants[None, None, :, REFERENCE]), tau, own)
+    tau: FloatArray
+    constants: FloatArray
 
+    @property
+    def fixed_rows(self) -> BoolArray:
+        """The rows (a,) that inverse kinematics cannot choose: those without a reading, and those
+        whose reading is never commanded.
+        """
+        return (self.constants[:, SOURCE] < 0) | np.isfinite(self.constants[:, REFERENCE])
 
-def term_derivatives(
-    q: FloatArray, tau: FloatArray, constants: FloatArray, terms: Sequence[int] | None = None
-) -> list[FloatArray]:
-    """Return the derivative of what the transmissions give in each of the terms, or in some of
-    them, arrays (t | 1, n, a).
-    """
-    end = len(ALL_TERMS) + count_points(constants)
-    chosen = range(min(tau.shape[-1], end)) if terms is None else terms
-    return _divide_by_arms(_evaluate_shapes(q, constants, chosen), q, tau, constants, chosen)
+    @property
+    def triangles(self) -> IntArray:
+        """The places of the actuators that are triangle drives."""
+        if self.tau.shape[-1] == len(TERMS):
+            return np.zeros(0, np.int64)
+        return np.flatnonzero(self.tau[0, :, SIDE])
 
+    @property
+    def table(self) -> FloatArray:
+        """The values (t | 1, a, K) of tables."""
+        first = len(ALL_TERMS)
+        return self.tau[..., first : first + self.points]
 
-def _evaluate_shapes(
-    q: FloatArray, constants: FloatArray, terms: Sequence[int], derivative: bool = False
-) -> list[FloatArray]:
-    """Return what each of the terms adds per unit to what the transmissions give, (t | 1, n, a), or
-    its derivative by the reading; a dimension of a triangle adds nothing.
-    """
-    r, approach, load = split_readings(q, constants)
-    first, w = len(ALL_TERMS), constants[:, 0]
-    has_points = any(term >= first for term in terms)
-    of_points = _weigh_tables(r, constants, derivative) if has_points else r[..., None]
+    @property
+    def weights(self) -> FloatArray | None:
+        """The weights (t | 1, a, J) of summed drives, None of a machine without them."""
+        first = len(ALL_TERMS) + self.points
+        return self.tau[..., first:] if self.tau.shape[-1] > first else None
 
-    def evaluate(term: int) -> FloatArray:
-        if term >= first:
-            return of_points[..., term - first]
-        if term >= len(TERMS):
-            return np.zeros_like(r)
-        shape = SHAPES[TERMS[term]]
-        if derivative:
-            return shape.slope(r, w)
-        return shape.value(r, load if term == COMPLIANCE else approach, w)
+    def list_triangle_terms(self, triangles: IntArray | int) -> FloatArray:
+        """Return the terms (t | 1, 1, k, 10) of triangle drives, of a single one (t | 1, 1, 10)."""
+        return self.tau[:, None, triangles, len(TERMS) : len(ALL_TERMS)]
 
-    return [evaluate(term) for term in terms]
+    @property
+    def points(self) -> int:
+        """The largest number K of points that a table of these drives has."""
+        return self.constants.shape[1] - FIXED
 
+    @property
+    def _readings(self) -> int:
+        """How many readings the rows have, loads among them."""
+        return int(self.constants[:, SOURCE : LOADED + 1 : 2].max(initial=-1.0)) + 1
 
-def _sum_terms(
-    q: FloatArray, tau: FloatArray, constants: FloatArray, derivative: bool = False
-) -> FloatArray:
-    """Return the sum (t, n, a) of all terms but those of triangles, or its derivative by the
-    reading.
-    """
-    first = len(ALL_TERMS)
-    terms = [*range(len(TERMS)), *range(first, first + count_points(constants))]
-    shapes = _evaluate_shapes(q, constants, terms, derivative)
-    parts = (shape * tau[:, None, :, i] for i, shape in zip(terms, shapes, strict=True))
-    return sum(parts, start=np.zeros(1))
+    def evaluate_references(self) -> FloatArray:
+        """Return what the transmissions give (t | 1, 1, a) at the references of readings, and at
+        zero of those without one.
+        """
+        references = np.nan_to_num(self.constants[None, None, :, REFERENCE])
+        return self._select(slice(None)).evaluate_sums(references)
 
-
-def joints_from_readings(q: FloatArray, tau: FloatArray, constants: FloatArray) -> FloatArray:
-    """Return the joint values (t, n, a) of readings q under terms tau, NaN where no angle of a
-    triangle drive reaches its length. Summed drives must have as many readings as joints.
-    """
-    values = transmit_readings(q, tau, constants)
-    if (weights := select_weights(tau, constants)) is not None:
-        return apply_weights(invert_weights(weights), values)
-    return values
-
-
-def transmit_readings(q: FloatArray, tau: FloatArray, constants: FloatArray) -> FloatArray:
-    """Return what the transmissions give (t, n, a): joint values, and of summed drives the sums."""
-    values = evaluate_sums(q, tau, constants)
-    triangles = find_triangles(tau)
-    if len(triangles):
-        values = np.array(values)
-        values[..., triangles] = compute_angle(
-            values[..., triangles], _select_triangles(tau, triangles)
-        )
-    return values
-
-
-def joint_slopes(q: FloatArray, tau: FloatArray, constants: FloatArray) -> FloatArray:
-    """Return d joint / d reading (t, n, a), of plain gains (t | 1, 1, a); of summed drives d sum /
-    d reading.
-    """
-    return _divide_by_arms([evaluate_slopes(q, tau, constants)], q, tau, constants)[0]
-
-
-def _divide_by_arms(
-    slopes: Sequence[FloatArray],
-    q: FloatArray,
-    tau: FloatArray,
-    constants: FloatArray,
-    terms: Sequence[int] = (),
-) -> list[FloatArray]:
-    """Return slopes (t | 1, n | 1, a) of angles, of those of the lengths of triangles; terms : by
-    which the slopes are.
-    """
-    triangles = find_triangles(tau)
-    if not len(triangles):
-        return list(slopes)
-    angles = transmit_readings(q, tau, constants)[..., triangles]
-    arm, by_term = differentiate_length(angles, _select_triangles(tau, triangles))
-    columns = [np.array(np.broadcast_to(s, (*arm.shape[:2], len(constants)))) for s in slopes]
-    for term, column in zip(terms, columns, strict=False):
-        if len(TERMS) <= term < len(TERMS) + MOVABLE:
-            column[..., triangles] = -by_term[..., term - len(TERMS)]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        for column in columns:
-            column[..., triangles] /= arm
-    return columns
-
-
-def differentiate_by_readings(q: FloatArray, tau: FloatArray, constants: FloatArray) -> FloatArray:
-    """Return the derivatives (t | 1, n | 1, a, readings) of what the transmissions give by all
-    readings, loads among them.
-    """
-    columns = np.arange(count_readings(constants))
-    slopes = joint_slopes(q, tau, constants)
-    by_readings = slopes[..., None] * (constants[:, SOURCE, None] == columns)
-    if (constants[:, LOADED] < 0).all():
-        return by_readings
-    (by_load,) = _divide_by_arms([tau[:, None, :, COMPLIANCE]], q, tau, constants)
-    return by_readings + by_load[..., None] * (constants[:, LOADED, None] == columns)
-
-
-def readings_from_joints(
-    joints: FloatArray, tau: FloatArray, constants: FloatArray, loads: FloatArray | None = None
-) -> FloatArray:
-    """Return the readings (t, n, r) of joint values at loads (t | 1, n, a) of the rows, without
-    backlash; Newton's method adds what is not linear; NaN where no reading gives the value. Other
-    readings that are never commanded have their reference, and loads are zero without `loads`.
-    """
-    if (weights := select_weights(tau, constants)) is not None:
-        joints = apply_weights(weights, joints)
-    fixed, count = find_fixed_rows(constants), count_readings(constants)
-    if fixed.any() or count > len(constants):
-        own, terms = constants[~fixed], len(ALL_TERMS) + count_points(constants)
+    def _select(self, rows: BoolArray | slice) -> Transmissions:
+        """Return some of the rows, each with a reading of its own, without loads and weights."""
+        own = self.constants[rows].copy()
         own[:, SOURCE], own[:, LOADED] = np.arange(len(own)), -1
-        given = None if loads is None else loads[..., ~fixed]
-        readings = readings_from_joints(joints[..., ~fixed], tau[:, ~fixed, :terms], own, given)
-        source, load = constants[:, SOURCE].astype(int), constants[:, LOADED].astype(int)
-        last = np.full((*readings.shape[:2], count), np.nan)
-        last[..., source[~fixed]] = readings
-        is_given, is_loaded = fixed & (source >= 0), load >= 0
-        last[..., source[is_given]] = constants[is_given, REFERENCE]
-        last[..., load[is_loaded]] = 0.0 if loads is None else loads[..., is_loaded]
-        return last
-    triangles = find_triangles(tau)
-    if len(triangles):
-        shape = np.broadcast_shapes(joints.shape, (len(tau), 1, 1))
-        joints = np.array(np.broadcast_to(joints, shape))
-        joints[..., triangles] = compute_length(
-            joints[..., triangles], _select_triangles(tau, triangles)
-        )
-    if loads is not None:
-        joints = joints - tau[:, None, :, COMPLIANCE] * loads
-    if len(tau) == 1 and not tau[..., 0].any() and bool((tau[..., 1] == 1.0).all()):
-        readings = joints
-    else:
-        with np.errstate(divide="ignore", invalid="ignore"):  # a cam has no gain
-            readings = (joints - tau[:, None, :, 0]) / tau[:, None, :, 1]
-    if not tau[..., 2:7].any() and not count_points(constants):
+        return Transmissions(self.tau[:, rows, : len(ALL_TERMS) + self.points], own)
+
+    def evaluate_sums(self, q: FloatArray) -> FloatArray:
+        """Return the joint values (t, n, a) of readings; of triangle drives lengths, else sums."""
+        if not self.tau[..., 2 : len(TERMS)].any() and not self.points:
+            readings = self._split_readings(q)[0]
+            if len(self.tau) in (1, len(q)) and (self.tau[..., :2] == (0.0, 1.0)).all():
+                return readings + 0.0  # no offset and no gain: one pass, with the same bits
+            return self.tau[:, None, :, 0] + readings * self.tau[:, None, :, 1]
+        return self._sum_terms(q)
+
+    def evaluate_slopes(self, q: FloatArray) -> FloatArray:
+        """Return d joint / d reading; of triangle drives d length / d reading."""
+        if not self.tau[..., 2:7].any() and not self.points:
+            return self.tau[:, None, :, 1]
+        return self._sum_terms(q, derivative=True)
+
+    def transmit(self, q: FloatArray) -> FloatArray:
+        """Return what the transmissions give (t, n, a): joint values, or of summed drives sums."""
+        values, triangles = self.evaluate_sums(q), self.triangles
+        if len(triangles):
+            values = np.array(values)
+            terms = self.list_triangle_terms(triangles)
+            values[..., triangles] = compute_angle(values[..., triangles], terms)
+        return values
+
+    def find_joints(self, q: FloatArray) -> FloatArray:
+        """Return the joint values (t, n, a) of readings, NaN where no angle of a triangle drive
+        reaches its length. Summed drives must have as many readings as joints.
+        """
+        values = self.transmit(q)
+        if (weights := self.weights) is not None:
+            return apply_weights(invert_weights(weights), values)
+        return values
+
+    def find_readings(self, joints: FloatArray, loads: FloatArray | None = None) -> FloatArray:
+        """Return the readings (t, n, r) of joint values at loads (t | 1, n, a) of the rows, without
+        backlash; Newton's method adds what is not linear; NaN where no reading gives the value.
+        Other readings that are never commanded have their reference, and loads are zero without
+        `loads`.
+        """
+        if (weights := self.weights) is not None:
+            joints = apply_weights(weights, joints)
+        fixed, count = self.fixed_rows, self._readings
+        if fixed.any() or count > len(self.constants):
+            given = None if loads is None else loads[..., ~fixed]
+            readings = self._select(~fixed).find_readings(joints[..., ~fixed], given)
+            source, load = self.constants[:, SOURCE : LOADED + 1 : 2].astype(int).T
+            last = np.full((*readings.shape[:2], count), np.nan)
+            last[..., source[~fixed]] = readings
+            is_given, is_loaded = fixed & (source >= 0), load >= 0
+            last[..., source[is_given]] = self.constants[is_given, REFERENCE]
+            last[..., load[is_loaded]] = 0.0 if loads is None else loads[..., is_loaded]
+            return last
+        triangles = self.triangles
+        if len(triangles):
+            shape = np.broadcast_shapes(joints.shape, (len(self.tau), 1, 1))
+            joints = np.array(np.broadcast_to(joints, shape))
+            terms = self.list_triangle_terms(triangles)
+            joints[..., triangles] = compute_length(joints[..., triangles], terms)
+        tau = self.tau
+        if loads is not None:
+            joints = joints - tau[:, None, :, COMPLIANCE] * loads
+        if len(tau) == 1 and not tau[..., 0].any() and bool((tau[..., 1] == 1.0).all()):
+            readings = joints
+        else:
+            with np.errstate(divide="ignore", invalid="ignore"):  # a cam has no gain
+                readings = (joints - tau[:, None, :, 0]) / tau[:, None, :, 1]
+        if not tau[..., 2:7].any() and not self.points:
+            return readings
+        if self.points:
+            readings = self._guess_readings(joints, readings)
+        step = np.zeros_like(readings)
+        for _ in range(20):
+            slopes = self.evaluate_slopes(readings)
+            step = (self.evaluate_sums(readings) - joints) / slopes
+            readings = readings - step
+            if np.abs(step).max(initial=0.0) <= 1e-15 * np.abs(readings).max(initial=1.0):
+                break
+        return np.where(np.abs(step) <= 1e-9 * (1.0 + np.abs(readings)), readings, np.nan)
+
+    def _guess_readings(self, joints: FloatArray, readings: FloatArray) -> FloatArray:
+        """Return first readings (t, n, a): of drives with tables by a line between points."""
+        shape = np.broadcast_shapes(readings.shape, joints.shape)
+        readings = np.array(np.broadcast_to(readings, shape))
+        for a in np.flatnonzero(np.isfinite(self.constants[:, FIXED])):
+            points = self.constants[a, FIXED:][np.isfinite(self.constants[a, FIXED:])]
+            own = np.repeat(points[None, :, None], len(self.constants), axis=2)
+            known = self.evaluate_sums(own)[..., a]
+            sign = np.where(known[:, -1] < known[:, 0], -1.0, 1.0)[:, None]
+            wanted, known = sign * joints[..., a], sign * known
+            low = (wanted[..., None] > known[:, None, 1:-1]).sum(axis=-1)
+            trials = np.broadcast_to(np.arange(len(known))[:, None], low.shape)
+            first, step = known[trials, low], np.diff(known)[trials, low]
+            with np.errstate(divide="ignore", invalid="ignore"):
+                share = (wanted - first) / step
+            readings[..., a] = points[low] + share * np.diff(points)[low]
         return readings
-    if count_points(constants):
-        readings = _guess_readings(joints, readings, tau, constants)
-    step = np.zeros_like(readings)
-    for _ in range(20):
-        slopes = evaluate_slopes(readings, tau, constants)
-        step = (evaluate_sums(readings, tau, constants) - joints) / slopes
-        readings = readings - step
-        if np.abs(step).max(initial=0.0) <= 1e-15 * np.abs(readings).max(initial=1.0):
-            break
-    return np.where(np.abs(step) <= 1e-9 * (1.0 + np.abs(readings)), readings, np.nan)
 
+    def differentiate_terms(
+        self, q: FloatArray, terms: Sequence[int] | None = None
+    ) -> list[FloatArray]:
+        """Return the derivative of what the transmissions give in each of the terms, or in some of
+        them, arrays (t | 1, n, a).
+        """
+        end = len(ALL_TERMS) + self.points
+        chosen = range(min(self.tau.shape[-1], end)) if terms is None else terms
+        return self._divide_by_arms(self._evaluate_shapes(q, chosen), q, chosen)
 
-def _guess_readings(
-    joints: FloatArray, readings: FloatArray, tau: FloatArray, constants: FloatArray
-) -> FloatArray:
-    """Return readings (t, n, a) to begin with: of drives with tables by a line between points."""
-    shape = np.broadcast_shapes(readings.shape, joints.shape)
-    readings = np.array(np.broadcast_to(readings, shape))
-    for a in np.flatnonzero(np.isfinite(constants[:, FIXED])):
-        points = constants[a, FIXED:][np.isfinite(constants[a, FIXED:])]
-        own = np.repeat(points[None, :, None], len(constants), axis=2)
-        known = evaluate_sums(own, tau, constants)[..., a]
-        sign = np.where(known[:, -1] < known[:, 0], -1.0, 1.0)[:, None]
-        wanted, known = sign * joints[..., a], sign * known
-        low = (wanted[..., None] > known[:, None, 1:-1]).sum(axis=-1)
-        trials = np.broadcast_to(np.arange(len(known))[:, None], low.shape)
-        first, step = known[trials, low], np.diff(known)[trials, low]
+    def differentiate(self, q: FloatArray) -> FloatArray:
+        """Return d joint / d reading (t, n, a), of plain gains (t | 1, 1, a); of summed drives
+        d sum / d reading.
+        """
+        return self._divide_by_arms([self.evaluate_slopes(q)], q)[0]
+
+    def differentiate_by_readings(self, q: FloatArray) -> FloatArray:
+        """Return the derivatives (t | 1, n | 1, a, readings) of what the transmissions give by all
+        readings, loads among them.
+        """
+        columns = np.arange(self._readings)
+        slopes = self.differentiate(q)
+        by_readings = slopes[..., None] * (self.constants[:, SOURCE, None] == columns)
+        if (self.constants[:, LOADED] < 0).all():
+            return by_readings
+        (by_load,) = self._divide_by_arms([self.tau[:, None, :, COMPLIANCE]], q)
+        return by_readings + by_load[..., None] * (self.constants[:, LOADED, None] == columns)
+
+    def differentiate_sums(self, q: FloatArray, joints: FloatArray) -> FloatArray:
+        """Return d (s - W joints) / d tau (t, n, a, k) at given readings and joints (t, n, J)."""
+        first = len(ALL_TERMS) + self.points
+        t, n = (max(sizes) for sizes in zip(q.shape[:2], joints.shape[:2], strict=True))
+        slopes = np.zeros((max(t, len(self.tau)), n, *self.tau.shape[1:]))
+        for i, column in enumerate(self.differentiate_terms(q)):
+            slopes[..., i] = column
+        slopes[..., first:] = -joints[:, :, None]
+        return slopes
+
+    def _divide_by_arms(
+        self, slopes: Sequence[FloatArray], q: FloatArray, terms: Sequence[int] = ()
+    ) -> list[FloatArray]:
+        """Return slopes (t | 1, n | 1, a) of angles, of those of the lengths of triangles; terms :
+        by which the slopes are.
+        """
+        triangles = self.triangles
+        if not len(triangles):
+            return list(slopes)
+        angles = self.transmit(q)[..., triangles]
+        arm, by_term = differentiate_length(angles, self.list_triangle_terms(triangles))
+        columns = [
+            np.array(np.broadcast_to(s, (*arm.shape[:2], len(self.constants)))) for s in slopes
+        ]
+        for term, column in zip(terms, columns, strict=False):
+            if len(TERMS) <= term < len(TERMS) + MOVABLE:
+                column[..., triangles] = -by_term[..., term - len(TERMS)]
         with np.errstate(divide="ignore", invalid="ignore"):
-            share = (wanted - first) / step
-        readings[..., a] = points[low] + share * np.diff(points)[low]
-    return readings
+            for column in columns:
+                column[..., triangles] /= arm
+        return columns
 
+    def _sum_terms(self, q: FloatArray, derivative: bool = False) -> FloatArray:
+        """Return the sum (t, n, a) of all terms but those of triangles, or its derivative by the
+        reading.
+        """
+        first = len(ALL_TERMS)
+        terms = [*range(len(TERMS)), *range(first, first + self.points)]
+        shapes = self._evaluate_shapes(q, terms, derivative)
+        parts = (shape * self.tau[:, None, :, i] for i, shape in zip(terms, shapes, strict=True))
+        return sum(parts, start=np.zeros(1))
 
-def select_table(tau: FloatArray, constants: FloatArray) -> FloatArray:
-    """Return the values (t | 1, a, K) of tables."""
-    first = len(ALL_TERMS)
-    return tau[..., first : first + count_points(constants)]
+    def _evaluate_shapes(
+        self, q: FloatArray, terms: Sequence[int], derivative: bool = False
+    ) -> list[FloatArray]:
+        """Return what each of the terms adds per unit to what the transmissions give, (t | 1, n,
+        a), or its derivative by the reading; a dimension of a triangle adds nothing.
+        """
+        r, approach, load = self._split_readings(q)
+        first, w = len(ALL_TERMS), self.constants[:, 0]
+        has_points = any(term >= first for term in terms)
+        of_points = self._weigh_tables(r, derivative) if has_points else r[..., None]
 
+        def evaluate(term: int) -> FloatArray:
+            if term >= first:
+                return of_points[..., term - first]
+            if term >= len(TERMS):
+                return np.zeros_like(r)
+            shape = SHAPES[TERMS[term]]
+            if derivative:
+                return shape.slope(r, w)
+            return shape.value(r, load if term == COMPLIANCE else approach, w)
 
-def select_weights(tau: FloatArray, constants: FloatArray) -> FloatArray | None:
-    """Return the weights (t | 1, a, J) of summed drives, None of a machine without them."""
-    first = len(ALL_TERMS) + count_points(constants)
-    return tau[..., first:] if tau.shape[-1] > first else None
+        return [evaluate(term) for term in terms]
 
+    def _weigh_tables(self, r: FloatArray, derivative: bool) -> FloatArray:
+        """Return the weights of the values of all tables at readings (t, n, a), (t, n, a, K), or
+        their derivatives by the reading. Outside its points a table is straight.
+        """
+        weights = np.zeros((*r.shape, self.points))
+        for a, row in enumerate(self.constants):
+            points = row[FIXED:][np.isfinite(row[FIXED:])]
+            if len(points):
+                spline, own = make_spline(points.tobytes(), bool(row[1])), r[..., a]
+                inside = np.where(np.isfinite(own), np.clip(own, points[0], points[-1]), points[0])
+                slope = spline(inside, 1)
+                chosen = slope if derivative else spline(inside) + slope * (own - inside)[..., None]
+                weights[..., a, : len(points)] = chosen
+        return weights
 
-def differentiate_sums(
-    q: FloatArray, tau: FloatArray, constants: FloatArray, joints: FloatArray
-) -> FloatArray:
-    """Return d (s - W joints) / d tau at constant readings and joints (t, n, J), (t, n, a, k)."""
-    first = len(ALL_TERMS) + count_points(constants)
-    t, n = (max(sizes) for sizes in zip(q.shape[:2], joints.shape[:2], strict=True))
-    slopes = np.zeros((max(t, len(tau)), n, *tau.shape[1:]))
-    for i, column in enumerate(term_derivatives(q, tau, constants)):
-        slopes[..., i] = column
-    slopes[..., first:] = -joints[:, :, None]
-    return slopes
+    def _split_readings(self, q: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return the reading, approach direction and load of each row (.., a), 0 if not given."""
+        numbers = self.constants[:, SOURCE : LOADED + 1 : 2].astype(int)
+        a, source = int(numbers.max(initial=-1)) + 1, numbers[:, 0]
+        parts = q[..., :a], q[..., a:] if q.shape[-1] == 2 * a else np.zeros_like(q[..., :a])
+        if len(source) == a and bool((source == np.arange(a)).all()):
+            return *parts, np.zeros_like(parts[0])
+        none = np.zeros((*q.shape[:-1], 1))  # what a row with the number -1 reads
+        readings, approach = (np.concatenate([part, none], axis=-1) for part in parts)
+        return readings[..., source], approach[..., source], readings[..., numbers[:, 1]]
 
+    def measure_excess(self, q: FloatArray) -> FloatArray:
+        """Return by how much the lengths of triangles are out of their reach (t, n) [m], the
+        largest. It is NaN where a reading is not a number.
+        """
+        triangles = self.triangles
+        length = self.evaluate_sums(q)[..., triangles]
+        low, high = compute_range(self.list_triangle_terms(triangles))
+        return np.maximum(np.maximum(low - length, length - high), 0.0).max(axis=-1)
 
-def find_triangles(tau: FloatArray) -> IntArray:
-    """Return the places of the actuators that are triangle drives; tau : (t | 1, a, 8 | 18)."""
-    if tau.shape[-1] == len(TERMS):
-        return np.zeros(0, np.int64)
-    return np.flatnonzero(tau[0, :, SIDE])
-
-
-def measure_excess(q: FloatArray, tau: FloatArray, constants: FloatArray) -> FloatArray:
-    """Return by how much the lengths of triangles are out of their reach (t, n) [m], the largest.
-
-    It is NaN where a reading is not a number.
-    """
-    triangles = find_triangles(tau)
-    length = evaluate_sums(q, tau, constants)[..., triangles]
-    low, high = compute_range(_select_triangles(tau, triangles))
-    return np.maximum(np.maximum(low - length, length - high), 0.0).max(axis=-1)
-
-
-def evaluate_sums(q: FloatArray, tau: FloatArray, constants: FloatArray) -> FloatArray:
-    """Return the joint values (t, n, a) of readings; of triangle drives lengths, else sums."""
-    if not tau[..., 2 : len(TERMS)].any() and not count_points(constants):
-        readings = split_readings(q, constants)[0]
-        if len(tau) in (1, len(q)) and (tau[..., :2] == (0.0, 1.0)).all():
-            return readings + 0.0  # no offset and no gain: one pass, with the same bits
-        return tau[:, None, :, 0] + readings * tau[:, None, :, 1]
-    return _sum_terms(q, tau, constants)
-
-
-def evaluate_slopes(q: FloatArray, tau: FloatArray, constants: FloatArray) -> FloatArray:
-    """Return d joint / d reading; of triangle drives d length / d reading."""
-    if not tau[..., 2:7].any() and not count_points(constants):
-        return tau[:, None, :, 1]
-    return _sum_terms(q, tau, constants, derivative=True)
-
-
-def _select_triangles(tau: FloatArray, triangles: IntArray) -> FloatArray:
-    """Return the terms (t | 1, 1, k, 10) of triangles."""
-    return tau[:, None, triangles, len(TERMS) : len(ALL_TERMS)]
-
-
-def find_reversed(joints: FloatArray, tau: FloatArray, triangles: IntArray) -> BoolArray:
-    """Return which angles (t, n, k) of triangle drives lie beyond a dead center, on the side that
-    their readings do not lead to.
-    """
-    triangle = _select_triangles(tau, triangles)
-    _, _, gamma = describe_triangle(triangle)
-    return np.sin(joints[..., triangles] - gamma) * triangle[..., 8] < 0.0
-
-
-def count_readings(constants: FloatArray) -> int:
-    """Return how many readings the rows have, loads among them."""
-    return int(constants[:, SOURCE : LOADED + 1 : 2].max(initial=-1.0)) + 1
-
-
-def split_readings(
-    q: FloatArray, constants: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the reading, direction of approach and load of each row (.., a), 0 if not given."""
-    numbers = constants[:, SOURCE : LOADED + 1 : 2].astype(int)
-    a, source = int(numbers.max(initial=-1)) + 1, numbers[:, 0]
-    parts = q[..., :a], q[..., a:] if q.shape[-1] == 2 * a else np.zeros_like(q[..., :a])
-    if len(source) == a and bool((source == np.arange(a)).all()):
-        return *parts, np.zeros_like(parts[0])
-    none = np.zeros((*q.shape[:-1], 1))  # what a row with the number -1 reads
-    readings, approach = (np.concatenate([part, none], axis=-1) for part in parts)
-    return readings[..., source], approach[..., source], readings[..., numbers[:, 1]]
+    def find_reversed(self, joints: FloatArray, triangles: IntArray) -> BoolArray:
+        """Return which angles (t, n, k) of triangle drives lie beyond a dead center, on the side
+        that their readings do not lead to.
+        """
+        triangle = self.list_triangle_terms(triangles)
+        _, _, gamma = describe_triangle(triangle)
+        return np.sin(joints[..., triangles] - gamma) * triangle[..., 8] < 0.0

@@ -155,7 +155,7 @@ def test_engines_agree_on_the_least_squares_closure(text: str, tmp_path: Path) -
     robot = load_text(tmp_path, close_by_least_squares(text))
     values, q = draw(robot, 7)
     e, _ = robot.slots(values)
-    joints = q + robot.slots(values)[1][:, None, :, 0]  # the offset is the first term
+    joints = q + robot.slots(values)[1].tau[:, None, :, 0]  # the offset is the first term
     own = newton.solve(robot.program, e, joints, robot.home_state)
     other = engine.solve(robot.program, e, joints, robot.home_state)
     assert (own.status == engine.CONVERGED).all()

@@ -18,10 +18,11 @@ def test_shared_maps_add_to_their_addresses(is_common: bool) -> None:
         shared = tuple((of, i, slots.shared[0][2]) for of, i, _ in slots.shared)
         slots = replace(slots, shared=shared)
     parts = [replace(slots, shared=(one,), matrix=0.0 * slots.matrix) for one in slots.shared]
-    e, tau = slots(values)
+    e, drives = slots(values)
     linear = replace(slots, shared=())
     expected = [linear(values), *(part(values) for part in parts)]
     assert_allclose(e, sum(each[0] for each in expected), atol=1e-15)
-    assert_allclose(tau - slots.terms, sum(t - slots.terms for _, t in expected), atol=1e-15)
+    changes = (each[1].tau - slots.terms for each in expected)
+    assert_allclose(drives.tau - slots.terms, sum(changes), atol=1e-15)
     jacobians = [linear.jacobian(values), *(part.jacobian(values) for part in parts)]
     assert_allclose(slots.jacobian(values), sum(jacobians), atol=1e-15)

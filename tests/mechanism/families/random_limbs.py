@@ -14,7 +14,6 @@ from loopcal.mechanism.families.placement import Point, PoseRecord
 from loopcal.mechanism.kinematics import compute_readings
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.states import select_poses
-from loopcal.mechanism.transmission import joints_from_readings
 from loopcal.units import Dimension
 
 Array = NDArray[np.float64]
@@ -63,13 +62,8 @@ def sample_near_home(machine: Mechanism, n: int, seed: int) -> tuple[State, Arra
         compute_readings(machine, machine.values[None], machine.home_state)
         + rng.uniform(-1, 1, (1, n, len(width))) * width
     )
-    e, tau = machine.slots(machine.values[None])
-    state = engine.solve(
-        machine.program,
-        e,
-        joints_from_readings(q, tau, machine.slots.constants),
-        machine.home_state,
-    )
+    e, drives = machine.slots(machine.values[None])
+    state = engine.solve(machine.program, e, drives.find_joints(q), machine.home_state)
     # random machines have small workspaces: keep rows that closed in the mode of home
     good = (state.status[0] == 0) & (state.closure_sign[0] == machine.home_state.closure_sign[0, 0])
     return select_poses(state, good), q[:, good]

@@ -12,14 +12,10 @@ from loopcal.mechanism.transmission import (
     SIDE,
     TABLE,
     TRIANGLE_TERMS,
-    joint_slopes,
-    joints_from_readings,
+    Transmissions,
     list_constants,
     name_terms,
     nominal_terms,
-    readings_from_joints,
-    term_derivatives,
-    transmit_readings,
 )
 from loopcal.units import Dimension
 
@@ -75,8 +71,9 @@ def test_the_derivative_by_a_term_is_that_of_differences(term: str) -> None:
     i = names.index(term)
     move = np.zeros_like(tau)
     move[..., i] = STEP
-    low, high = (joints_from_readings(q, tau + s * move, constants) for s in (-1.0, 1.0))
-    found = np.broadcast_to(term_derivatives(q, tau, constants)[i], low.shape)
+    low, high = (Transmissions(tau + s * move, constants).find_joints(q) for s in (-1.0, 1.0))
+    slopes = Transmissions(tau, constants).differentiate_terms(q)
+    found = np.broadcast_to(slopes[i], low.shape)
     acts = [a.name for k, a in enumerate(DRIVES) if np.abs(found[..., k]).max() > 1e-3]
     assert acts  # each term moves a joint of this machine
     drives = [k for k, a in enumerate(DRIVES) if a.is_triangle or term not in TRIANGLE_TERMS]
@@ -88,10 +85,10 @@ def test_the_derivative_by_a_term_is_that_of_differences(term: str) -> None:
 @pytest.mark.parametrize("machine", MACHINES)
 def test_the_slope_of_a_transmission_is_that_of_differences(machine: str) -> None:
     q, tau, constants, _ = describe(machine)
-    move = np.zeros_like(q)
+    drives, move = Transmissions(tau, constants), np.zeros_like(q)
     move[..., : len(constants)] = STEP
-    low, high = (transmit_readings(q + s * move, tau, constants) for s in (-1.0, 1.0))
-    found = np.broadcast_to(joint_slopes(q, tau, constants), low.shape)
+    low, high = (drives.transmit(q + s * move) for s in (-1.0, 1.0))
+    found = np.broadcast_to(drives.differentiate(q), low.shape)
     # a step across a corner of the broken line is excluded
     corner = np.abs(q[..., : len(constants), None] - np.array(POINTS)).min(axis=-1) > 2 * STEP
     assert_allclose(found[corner], ((high - low) / (2 * STEP))[corner], rtol=1e-6, atol=1e-8)
@@ -100,16 +97,16 @@ def test_the_slope_of_a_transmission_is_that_of_differences(machine: str) -> Non
 @pytest.mark.parametrize("machine", MACHINES)
 def test_readings_come_back_from_joint_values(machine: str) -> None:
     q, tau, constants, _ = describe(machine)
-    plain = q[..., : len(constants)]
-    joints = joints_from_readings(plain, tau, constants)
-    assert_allclose(readings_from_joints(joints, tau, constants), plain, rtol=0, atol=1e-13)
+    plain, drives = q[..., : len(constants)], Transmissions(tau, constants)
+    joints = drives.find_joints(plain)
+    assert_allclose(drives.find_readings(joints), plain, rtol=0, atol=1e-13)
 
 
 def test_a_table_goes_through_its_points_and_straight_on() -> None:
     _, tau, constants, _ = describe("one joint each")
     q = np.zeros((1, 7, 4))
     q[0, :, 2] = [*POINTS, 0.6, 0.7]
-    cam = joints_from_readings(q, tau[:1], constants)[0, :, 2]
+    cam = Transmissions(tau[:1], constants).find_joints(q)[0, :, 2]
     assert_allclose(cam[:5], list(CAM.values()), atol=1e-15)
     assert_allclose(cam[6] - cam[5], cam[5] - cam[4], atol=1e-14)
 

@@ -28,18 +28,14 @@ from loopcal.mechanism.model import Mechanism, Stage
 from loopcal.mechanism.platform_coordinates import EULER, POSITION, TILT, read_coordinates
 from loopcal.mechanism.solutions import Solution, inverse, jacobian
 from loopcal.mechanism.transmission import (
-    ALL_TERMS,
     FIXED,
     HARMONICS,
     REFERENCE,
     SOURCE,
     TERMS,
+    Transmissions,
     describe_triangle,
-    evaluate_references,
-    find_triangles,
     make_spline,
-    select_table,
-    select_weights,
 )
 from loopcal.mechanism.workspace import sample_workspace
 from loopcal.typing import BoolArray, FloatArray
@@ -148,12 +144,12 @@ def note_lost_terms(robot: Mechanism, name: str) -> tuple[Finding, ...]:
     """
     lost = []
     for stage in robot.blocks:
-        _, tau = stage.robot.slots(robot.values[None, stage.parameters])
-        drives = robot.actuators[stage.actuators]
-        for row, terms in zip(stage.robot.slots.constants, tau[0], strict=True):
+        _, drives = stage.robot.slots(robot.values[None, stage.parameters])
+        names = [actuator.name for actuator in robot.actuators[stage.actuators]]
+        for row, terms in zip(drives.constants, drives.tau[0], strict=True):
             own = (term for term, value in zip(TERMS, terms, strict=False) if value)
             if row[SOURCE] >= 0:
-                lost += [f"{drives[int(row[SOURCE])].name}.{t}" for t in own if t not in SHAPES]
+                lost += [f"{names[int(row[SOURCE])]}.{t}" for t in own if t not in SHAPES]
     return (report_finding("files.not-expressed", format=name, names=tuple(lost)),) if lost else ()
 
 
@@ -225,9 +221,9 @@ def _collect_tables(robot: Mechanism, commanded: BoolArray) -> _Tables:
     for i, stage in enumerate(robot.blocks):
         mount = _flatten(stage.mount)
         tables.stages.append([stage.parent, len(tables.bodies), i in carrying, mount])
-        e, tau = stage.robot.slots(robot.values[None, stage.parameters])
+        e, transmissions = stage.robot.slots(robot.values[None, stage.parameters])
         _add_limbs(tables, stage.robot, e, drives)
-        _add_transmissions(tables, stage, tau, reading[stage.actuators].tolist(), drives)
+        _add_transmissions(tables, stage, transmissions, reading[stage.actuators].tolist(), drives)
         drives += stage.robot.program.n_joints
     return tables
 
@@ -411,15 +407,11 @@ def _add_limbs(tables: _Tables, robot: Mechanism, e: FloatArray, drives: int) ->
 
 
 def _add_transmissions(
-    tables: _Tables, stage: Stage, tau: FloatArray, readings: list[int], drives: int
+    tables: _Tables, stage: Stage, own: Transmissions, readings: list[int], drives: int
 ) -> None:
-    """Add the rows of a stage with terms tau (1, a, k), and where its readings are, -1 for those
-    that are never commanded.
-    """
-    constants = stage.robot.slots.constants
-    references = evaluate_references(tau, constants)[0, 0]
-    triangles, weights = find_triangles(tau), select_weights(tau, constants)
-    for a, row in enumerate(constants):
+    """Add the rows of a stage, and where its readings are, -1 for those never commanded."""
+    tau, references, weights = own.tau, own.evaluate_references()[0, 0], own.weights
+    for a, row in enumerate(own.constants):
         source, points = int(row[SOURCE]), row[FIXED:][np.isfinite(row[FIXED:])]
         is_fixed = source < 0 or bool(np.isfinite(row[REFERENCE]))
         for i, name in enumerate(() if is_fixed else SHAPES):
@@ -427,14 +419,14 @@ def _add_transmissions(
             tables.slots[-1][place] = ("TERM_OF_SUM", len(tables.sums), i)
         pieces: list[list[float]] = []
         if len(points):
-            own = select_table(tau, constants)[0, a, : len(points)]
-            c = make_spline(points.tobytes(), bool(row[1])).c @ own  # (powers, pieces)
+            values = own.table[0, a, : len(points)]
+            c = make_spline(points.tobytes(), bool(row[1])).c @ values  # (powers, pieces)
             c = np.concatenate([np.zeros((4 - len(c), c.shape[1])), c])
             ends = zip(points[:-1].tolist(), points[1:].tolist(), c.T.tolist(), strict=True)
             pieces = [[low, high, *powers] for low, high, powers in ends]
         triangle = [0.0] * 5
-        if a in triangles:
-            terms = tau[0, a, len(TERMS) : len(ALL_TERMS)]
+        if a in own.triangles:
+            terms = own.list_triangle_terms(a)[0, 0]
             triangle = [*map(float, describe_triangle(terms)), *terms[-2:].tolist()]
         tables.sums.append(
             _Transmission(
@@ -449,8 +441,8 @@ def _add_transmissions(
             )
         )
         tables.pieces.extend(pieces)
-        own = np.eye(len(constants))[a] if weights is None else weights[0, a]
-        tables.weights.append((drives, own))
+        of_joints = np.eye(len(own.constants))[a] if weights is None else weights[0, a]
+        tables.weights.append((drives, of_joints))
 
 
 def _draw_poses(robot: Mechanism) -> tuple[FloatArray, Solution]:

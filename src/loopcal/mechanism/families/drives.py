@@ -38,11 +38,11 @@ from loopcal.mechanism.transmission import (
     LOAD,
     TABLE,
     WEIGHT,
+    Transmissions,
     complete_triangle,
     compute_range,
     count_independent,
     describe_triangle,
-    evaluate_sums,
     list_constants,
     nominal_terms,
 )
@@ -842,7 +842,8 @@ def _check_table(placed: PlacedRow, drive: Drive) -> None:
     share = np.linspace(0.0, 1.0, 9)[:-1]
     own = [replace(placed.actuator, terms=placed.law)]
     readings = np.append(points[:-1, None] + share * np.diff(points)[:, None], points[-1])
-    values = evaluate_sums(readings[None, :, None], nominal_terms(own)[None], list_constants(own))
+    law = Transmissions(nominal_terms(own)[None], list_constants(own))
+    values = law.evaluate_sums(readings[None, :, None])
     steps = np.diff(values[0, :, 0])
     if not ((steps > 0.0).all() or (steps < 0.0).all()):
         sentence = "has a table that turns its joint back, so two readings have one joint value"
