@@ -299,6 +299,15 @@ def test_random_data_are_explained_by_nothing_and_the_text_lists_what_was_tried(
     assert result.finding.data["tried"] > len([*of_values, *of_readings])
 
 
+def test_readings_that_no_interpretation_brings_within_reach_are_unexplained() -> None:
+    robot = load_cached_robot("linear-delta")
+    stops = np.array([".stop" in name for name in robot.parameters.names])
+    far = robot.with_values(np.where(stops, 300.0, robot.values))
+    result = compare_conventions(far, simulate_data("linear-delta", Position()))
+    assert result.finding is not None
+    assert (result.finding.code, result.finding.data["reached"]) == ("conventions.unexplained", 0)
+
+
 def test_heights_of_the_wrong_sign_or_unit_are_named() -> None:
     """A probe that reports the correction: heights of a delta, between 0 and 20 mm."""
     robot = load_cached_robot("linear-delta")

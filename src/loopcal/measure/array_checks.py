@@ -64,8 +64,11 @@ def broadcast_array(value: ArrayLike, shape: tuple[int, ...], what: str, wanted:
 
 
 def drop_repeats(array: FloatArray) -> FloatArray:
-    """Return an array with length one along the axes along which broadcasting repeats it."""
-    return array[tuple(slice(None) if step else slice(1) for step in array.strides)]
+    """Return an array with length one along the axes along which broadcasting repeats it; an empty
+    one, whose strides say nothing about repeats, as it is.
+    """
+    steps = array.strides if array.size else (1,) * array.ndim
+    return array[tuple(slice(None) if step else slice(1) for step in steps)]
 
 
 def take_rows(array: FloatArray, rows: IntArray | BoolArray) -> FloatArray:
