@@ -619,13 +619,14 @@ def fold_at(factor: FloatArray, rows: FloatArray, places: IntArray) -> FloatArra
     """Return factors (a, n, h, w) with rows (a, k, w) folded in at places (k,)."""
     used, w = factor.shape[2:]
     order = np.argsort(places, kind="stable")
-    parts = np.split(order, np.flatnonzero(np.diff(places[order])) + 1) if len(order) else []
-    out = _with_height(factor, min(w, used + max(map(len, parts), default=0)))
-    for own in parts:
-        node = places[own[0]]
-        whole = np.hstack([factor[:, node], rows[:, own]])
-        triangle = np.asarray(np.linalg.qr(whole, mode="r"))
-        out[:, node, : triangle.shape[1]] = triangle
+    count = np.bincount(places, minlength=factor.shape[1])
+    first = np.cumsum(count) - count
+    out = _with_height(factor, min(w, used + int(count.max(initial=0))))
+    for number in find_distinct(count[count > 0]):  # nodes with as many new rows together
+        nodes = np.flatnonzero(count == number)
+        own = rows[:, order[first[nodes][:, None] + np.arange(number)]]
+        triangles = np.linalg.qr(np.concatenate([factor[:, nodes], own], axis=2), mode="r")
+        out[:, nodes, : triangles.shape[2]] = triangles
     return out
 
 
