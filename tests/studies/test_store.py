@@ -110,7 +110,7 @@ with open_store(Path(sys.argv[1])) as store:
     for number in range(10):
         store.add_block(f"key{number}", A, number, make_scores(number), 0.1)
         print(number, flush=True)
-    store.connection.execute("INSERT INTO cells (levels) VALUES ('unfinished')")
+    store.connection.execute("INSERT INTO cells VALUES (7, 'unfinished', x'')")
     os.kill(os.getpid(), signal.SIGKILL)
 """
 
@@ -161,7 +161,7 @@ def test_store_of_another_format_is_refused_and_unchanged(folder) -> None:
     connection.close()
     before = (folder / NAME).read_bytes()
     for opens in (open_store, read_store):
-        with expect_refusal("store.other-format", FileError, found=7, known=2), opens(folder):
+        with expect_refusal("store.other-format", FileError, found=7, known=3), opens(folder):
             pass
     assert (folder / NAME).read_bytes() == before
 
@@ -268,6 +268,39 @@ def test_damaged_block_is_named_and_its_place_becomes_free(folder, tmp_path, cha
     with read_store(folder) as store:
         for number, scores in store.read_blocks(A):
             np.testing.assert_array_equal(scores, make_scores(number))
+
+
+COLUMNS = {
+    "study": ("name", "value", "digest"),
+    "cells": ("id", "levels", "digest"),
+    "blocks": ("key", "cell", "block", "trials", "scores", "seconds", "digest"),
+}
+
+
+@pytest.mark.parametrize(("table", "column"), [(t, c) for t in COLUMNS for c in COLUMNS[t]])
+def test_a_change_of_any_column_is_named(folder, table, column) -> None:
+    with open_store(folder) as store:
+        store.add_block("key", A, 0, make_scores(0), 0.1)
+        store.add_block("key", B, 0, make_scores(1), 0.1)
+    with closing(sqlite3.connect(folder / NAME)) as connection, connection:
+        listed = connection.execute(f"SELECT name, type FROM pragma_table_info('{table}')")
+        types = dict(listed.fetchall())
+        assert tuple(types) == COLUMNS[table]
+        blob = f"CAST(substr({column}, 2) || x'07' AS BLOB)"
+        text, number = f"replace({column}, substr({column}, 3, 1), 'x')", f"{column} + 7"
+        change = {"BLOB": blob, "TEXT": text}.get(types[column], number)
+        first = f"(SELECT min({'name' if table == 'study' else 'rowid'}) FROM {table})"
+        row = f"{'name' if table == 'study' else 'rowid'} = {first}"
+        assert connection.execute(f"UPDATE {table} SET {column} = {change} WHERE {row}").rowcount
+    code = "store.damaged" if table == "study" else "store.block-damaged"
+    with expect_refusal(code, FileError), read_store(folder) as store:
+        _ = store.header, list(store.read_blocks(A)), list(store.read_blocks(B))
+    if table != "study":
+        with open_store(folder) as store:
+            assert len(store.remove_damaged()) == 1
+            store.add_block("key", A, 0, make_scores(0), 0.1)
+        with read_store(folder) as store:
+            assert [len(list(store.read_blocks(levels))) for levels in (A, B)] == [1, 1]
 
 
 def test_readers_leave_no_file_beside_a_store_that_no_driver_has(folder) -> None:

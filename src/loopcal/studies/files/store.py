@@ -8,11 +8,12 @@ driver that is killed (write-ahead log). The lock of a driver is one of the fold
 operating system releases when the driver ends in whatever way. Others can read meanwhile.
 
 Tables: `study` (name -> value), `cells` (levels as JSON) and `blocks` (key, cell, block, trials,
-scores as float64 of little end, seconds of computation, SHA-256 digest of all this).
+scores as float64 of little end, seconds of computation), each row with the SHA-256 digest of what
+it says.
 
 A store may come from others, so nothing in it runs: its tables are compared with ours before
 anything else is asked, which excludes triggers and views. The types and the length of a block are
-checked before it is read, and its digest when it is.
+checked before it is read, and its digest when it is; the digests of the other tables always.
 """
 
 from __future__ import annotations
@@ -82,7 +83,7 @@ def find_network_file_system(folder: Path) -> str | None:
 
 
 NAME = "study.sqlite"  # file name of a store in the folder of its study
-FORMAT = 2  # version of the tables; a store of another one is refused
+FORMAT = 3  # version of the tables; a store of another one is refused
 APPLICATION = 0x6C6F6F70  # by which SQLite knows a file of ours ("loop")
 LONGEST_NAME = 200  # characters of the name of a block in messages
 PATIENCE = 30.0  # seconds to wait for another program that locks the file
@@ -90,8 +91,9 @@ TABLES = f"""
 BEGIN;
 PRAGMA application_id = {APPLICATION};
 PRAGMA user_version = {FORMAT};
-CREATE TABLE study (name TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID;
-CREATE TABLE cells (id INTEGER PRIMARY KEY, levels TEXT NOT NULL UNIQUE);
+CREATE TABLE study (name TEXT PRIMARY KEY, value TEXT NOT NULL, digest BLOB NOT NULL)
+    WITHOUT ROWID;
+CREATE TABLE cells (id INTEGER PRIMARY KEY, levels TEXT NOT NULL UNIQUE, digest BLOB NOT NULL);
 CREATE TABLE blocks (
     key TEXT NOT NULL,
     cell INTEGER NOT NULL REFERENCES cells (id),
@@ -117,7 +119,7 @@ HAS_SHAPE = """
 typeof(key) = 'text' AND typeof(block) = 'integer' AND block >= 0
 AND typeof(trials) = 'integer' AND trials > 0 AND typeof(seconds) = 'real'
 AND seconds BETWEEN 0 AND 1e12 AND typeof(scores) = 'blob' AND length(scores) = 8 * trials * ?
-AND typeof(digest) = 'blob' AND typeof(levels) = 'text'
+AND typeof(blocks.digest) = 'blob' AND typeof(levels) = 'text'
 """
 
 WITH_CELLS = "FROM blocks LEFT JOIN cells ON cells.id = blocks.cell"
@@ -160,8 +162,12 @@ class StudyStore:
     @property
     def header(self) -> StoreHeader:
         """What the store says about its study."""
-        rows = dict(self.ask("SELECT name, value FROM study"))
+        rows = {}
         try:
+            for name, value, digest in self.ask("SELECT * FROM study"):
+                if _compute_digest(name, value, b"") != digest:
+                    raise ValueError("other texts")
+                rows[name] = value
             columns, versions = json.loads(rows["columns"]), json.loads(rows["versions"])
             if not isinstance(columns, list) or not isinstance(versions, dict):
                 raise ValueError("other types")
@@ -188,7 +194,8 @@ class StudyStore:
             "versions": json.dumps(dict(header.versions)),
         }
         with _report_errors(self.path), self.connection:
-            self.connection.executemany("REPLACE INTO study VALUES (?, ?)", rows.items())
+            digested = [(*row, _compute_digest(*row, b"")) for row in rows.items()]
+            self.connection.executemany("REPLACE INTO study VALUES (?, ?, ?)", digested)
 
     def add_block(
         self, key: str, levels: Levels, block: int, scores: FloatArray, seconds: float
@@ -273,13 +280,16 @@ class StudyStore:
             yield row
 
     def find_misshapen(self) -> dict[int, str]:
-        """Return the rows of blocks with wrong types or lengths, and the names of these blocks.
+        """Return the rows of blocks with wrong types or lengths, or of a cell whose text has
+        another digest, and the names of these blocks.
 
         Types and lengths are known without the content, which may be longer than LONGEST.
         """
         question = f"SELECT blocks.rowid {WITH_CELLS} WHERE NOT ({HAS_SHAPE})"
         width, usual = self.width, self.connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, 2**31 - 1)
         rows = [row for (row,) in self.ask(question, width)]
+        for cell in self._find_changed_cells():
+            rows += [row for (row,) in self.ask("SELECT rowid FROM blocks WHERE cell = ?", cell)]
         self.connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, usual)
         question = f"SELECT levels, block {WITH_CELLS} WHERE blocks.rowid = ?"
         found = {row: next(self.ask(question, row), None) for row in rows}
@@ -289,10 +299,11 @@ class StudyStore:
 
     def remove_damaged(self) -> tuple[str, ...]:
         """Remove all damaged blocks, which are then computed again, and return their names."""
-        damaged = self.find_misshapen()
+        damaged, cells = self.find_misshapen(), self._find_changed_cells()
         with _report_errors(self.path), self.connection:
             remove = "DELETE FROM blocks WHERE rowid = ?"
             self.connection.executemany(remove, [(row,) for row in damaged])
+            self.connection.executemany("DELETE FROM cells WHERE id = ?", [(c,) for c in cells])
             changed = dict(self._find_changed())
             self.connection.executemany(remove, [(row,) for row in changed])
         return (*damaged.values(), *changed.values())
@@ -307,14 +318,22 @@ class StudyStore:
     def _find_changed(self) -> Iterator[tuple[int, str]]:
         """Yield the rows and names of the well-shaped blocks whose digest is another."""
         columns = "levels, key, block, trials, seconds, scores"
-        for row, digest, *block in self.ask(f"SELECT blocks.rowid, digest, {columns} {WITH_CELLS}"):
+        for row, digest, *block in self.ask(
+            f"SELECT blocks.rowid, blocks.digest, {columns} {WITH_CELLS}"
+        ):
             if _compute_digest(*block) != digest:
                 yield row, _name_block(block[0], block[2])
+
+    def _find_changed_cells(self) -> list[int]:
+        """Return the rows of the cells whose digest is another."""
+        rows = self.ask("SELECT id, CAST(levels AS TEXT), digest FROM cells")
+        return [cell for cell, name, digest in rows if _compute_digest(name, b"") != digest]
 
     def _find_cell(self, levels: Levels) -> int:
         """Return the row of a cell, which is made where it is missing."""
         name = _name_cell(levels)
-        self.connection.execute("insert OR IGNORE INTO cells (levels) VALUES (?)", (name,))
+        question = "insert OR IGNORE INTO cells (levels, digest) VALUES (?, ?)"
+        self.connection.execute(question, (name, _compute_digest(name, b"")))
         (cell,) = self.connection.execute("SELECT id FROM cells WHERE levels = ?", (name,))
         return int(cell[0])
 
@@ -330,12 +349,12 @@ def _name_block(levels: object, block: object) -> str:
     return f"block {block} of {cell}"[:LONGEST_NAME]
 
 
-def _compute_digest(
-    levels: str, key: str, block: int, trials: int, seconds: float, content: bytes
-) -> bytes:
-    """Return the SHA-256 digest of a block of the cell of this name."""
-    head = json.dumps((levels, key, block, trials, seconds)).encode()
-    return hashlib.sha256(head + content).digest()
+def _compute_digest(*values: Any) -> bytes:
+    """Return the SHA-256 digest of what a row says: texts and numbers, and content (bytes) behind
+    them. A block says the name of its cell first.
+    """
+    *head, content = values
+    return hashlib.sha256(json.dumps(head).encode() + content).digest()
 
 
 def make_store(folder: Path, header: StoreHeader) -> None:
