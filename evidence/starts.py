@@ -9,6 +9,7 @@ rows at least as well as the truth does at the poses of the nominal machine.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,9 @@ from numpy.typing import NDArray
 
 from loopcal import geometry
 from loopcal.errors import DataError
-from loopcal.measure.initial_values import evaluate_measurements, guess_nuisance_values, whiten_rows
+from loopcal.estimate.pose_estimate import fit_nuisance_values
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.measure.initial_values import evaluate_measurements, whiten_rows
 from loopcal.measure.kinds.directions import Autocollimation, Direction, Inclination
 from loopcal.measure.kinds.distance import Distance, Separation
 from loopcal.measure.kinds.kind import Kind
@@ -26,6 +29,7 @@ from loopcal.measure.kinds.surfaces import Line, Plane, Sphere
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.nuisance import NuisanceParameters, collect_nuisance_parameters
 from loopcal.measure.observations import Observations
+from loopcal.mechanism.model import Mechanism
 
 Array = NDArray[np.float64]
 
@@ -161,6 +165,12 @@ class StartResult:
         )
 
 
+@cache
+def load_any_robot() -> Mechanism:
+    """Return a robot, on which start values at given poses do not depend."""
+    return load_robot("hexapod-42")
+
+
 def compute_start(name: str, seed: int) -> StartResult | None:
     """Compute start values for one draw of a kind; None if the drawn truth cannot be measured, such
     as a length below zero.
@@ -172,7 +182,7 @@ def compute_start(name: str, seed: int) -> StartResult | None:
     except DataError:
         return None
     believed = geometry.apply_twist(T, rng.normal(size=(POSES, 6)) * POSE_ERROR)
-    result = guess_nuisance_values(data, believed, local)
+    result = fit_nuisance_values(load_any_robot(), data, believed, local)
     left, best = (
         float(np.linalg.norm(whitened_residuals(data, believed, local, values)))
         for values in (result, truth)

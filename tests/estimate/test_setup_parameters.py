@@ -358,10 +358,10 @@ def test_trials_with_unknown_frames_equal_single_fits():
 
 def test_setup_start_values_are_computed_once_for_all_trials(monkeypatch):
     sought = []
-    begin = problem_module.guess_nuisance_values_batch
+    begin = problem_module.guess_nuisance_values
     monkeypatch.setattr(
         problem_module,
-        "guess_nuisance_values_batch",
+        "guess_nuisance_values",
         lambda data, *rest: (sought.append(data), begin(data, *rest))[1],
     )
     robot = lc.load_robot("linear-delta")

@@ -17,7 +17,7 @@ from loopcal.estimate.options import FitOptions
 from loopcal.estimate.penalties import LeastSquares
 from loopcal.estimate.pose_estimate import find_unclosed_poses
 from loopcal.estimate.result import Identification
-from loopcal.measure.initial_values import guess_nuisance_values_batch
+from loopcal.measure.initial_values import guess_nuisance_values
 from loopcal.mechanism.kinematics import forward_trials
 
 FILE = Path(lc.__file__).parent / "robots" / "cable-4.yaml"
@@ -134,5 +134,5 @@ def test_no_readings_lead_to_no_poses(robot):
 def test_measurements_without_rows_keep_the_number_of_sets(data):
     alone = lc.Measurements(data.robot_name, data.readings, (), reading_sigma=data.reading_sigma)
     T = np.broadcast_to(np.eye(4), (3, data.n_poses, 4, 4))
-    values = guess_nuisance_values_batch(alone, [], T, alone.nuisance_parameters)
+    values = guess_nuisance_values(alone, [], T, alone.nuisance_parameters)
     assert values.shape == (3, 0)

@@ -13,8 +13,8 @@ from scipy.stats import chi2
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.identification import identify
 from loopcal.estimate.linearization import Linearization, coordinate_derivative
+from loopcal.estimate.pose_estimate import fit_nuisance_values
 from loopcal.estimate.problem import problem_of
-from loopcal.measure.initial_values import guess_nuisance_values
 from loopcal.measure.instrument import Instrument, Sensor
 from loopcal.measure.kinds.distance import Separation
 from loopcal.measure.kinds.poses import Pose
@@ -69,7 +69,7 @@ def test_start_values_are_not_estimated_from_rounding():
     T = np.tile(hexapod().home, (POSES, 1, 1))
     T[:, :3, 3] += np.random.default_rng(0).uniform(-0.03, 0.03, (POSES, 3))
     T[:, :3, :3] += np.random.default_rng(1).uniform(-2e-16, 2e-16, (POSES, 3, 3))
-    assert_array_equal(guess_nuisance_values(data, T), 0.0)
+    assert_array_equal(fit_nuisance_values(hexapod(), data, T), 0.0)
 
 
 @pytest.mark.slow

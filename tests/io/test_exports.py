@@ -10,10 +10,11 @@ import pytest
 from loopcal import geometry
 from loopcal.cli.entry_point import main
 from loopcal.errors import FileError
+from loopcal.estimate.pose_estimate import fit_nuisance_values
 from loopcal.io.data.measurement_file import load_measurements
 from loopcal.io.exports.conversion import Conversion, convert_export
 from loopcal.io.exports.profile import find_profile_file, read_profile
-from loopcal.measure.initial_values import evaluate_measurements, guess_nuisance_values, whiten_rows
+from loopcal.measure.initial_values import evaluate_measurements, whiten_rows
 from loopcal.mechanism.solutions import forward
 from tests.io import export_texts, test_profiles
 from tests.io.export_texts import read_rows
@@ -46,7 +47,7 @@ def test_imported_examples_agree_with_the_robot_within_their_noise(
     assert [misfit["line"] for misfit in document["misfits"]] == misfits
     data = load_measurements("data.csv", robot)
     T = forward(robot, data.readings).T
-    values = guess_nuisance_values(data, T)
+    values = fit_nuisance_values(robot, data, T)
     white = whiten_rows(
         evaluate_measurements(data, T[None], values[None]), np.zeros((1, len(T), 6, 0))
     )[0, :, -1]

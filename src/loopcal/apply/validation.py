@@ -476,7 +476,8 @@ def _report_moved_setup(
 
     def measure_errors(refit: tuple[str, ...]) -> tuple[float, int]:
         """Return the whitened rms error with these fitted again, and the equations left over."""
-        values = {name: v for name, v in kept.items() if owner.get(name) not in refit}
+        moved = frozenset(refit)
+        values = {name: v for name, v in kept.items() if owner.get(name) not in moved}
         try:
             prediction = predict_poses(robot, data, compared.solution, compared.usable, values)
         except DataError:  # too few rows to fit it
@@ -485,7 +486,7 @@ def _report_moved_setup(
         for o, residual in zip(rows, prediction.residuals(rows), strict=True):
             present = np.where(o.present, residual, 0.0)
             total += float(((o.whitener @ present[..., None]) ** 2).sum())
-        fitted = sum(p.free and owner[p.name] in refit for p in entries)
+        fitted = sum(p.free and owner[p.name] in moved for p in entries)
         left = sum(o.n_residuals for o in rows) - fitted
         return float(np.sqrt(total / max(left, 1))), left
 

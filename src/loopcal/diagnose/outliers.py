@@ -564,7 +564,8 @@ def find_outliers(
         _refit_robustly(fit, data, member, progress) if fit.residual_test.exceeds_sigma else fit
     )
     z = fit.free_parameters.deviation(reference.robot.values[None])
-    start = problem.linearize(z, problem.start(z)).next_start
+    start = problem.start(z, seek=False).with_nuisance(reference.nuisance.estimate[None])
+    start = problem.linearize(z, start).next_start
     low_weight = np.zeros(len(labels), dtype=bool)
     if len(reference.pose_weights) == len(member):
         low_weight[member] = reference.pose_weights < 0.5

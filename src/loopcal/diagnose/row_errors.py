@@ -22,11 +22,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from loopcal.errors import DataError
-from loopcal.estimate.pose_estimate import PoseFit, fit_poses, predict_from_readings
+from loopcal.estimate.pose_estimate import (
+    PoseFit,
+    fit_nuisance_values,
+    fit_poses,
+    predict_from_readings,
+)
 from loopcal.estimate.posterior import combine_degrees
 from loopcal.estimate.result import SMALLEST_EFFECT
 from loopcal.estimate.smooth_errors import SmoothErrors
-from loopcal.measure.initial_values import guess_nuisance_values
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.nuisance import NuisanceParameters
 from loopcal.measure.observations import Observations
@@ -659,7 +663,7 @@ def predict_poses(
     values, kept = unknowns.values(), frozenset[str]()
     if setup is not None and len(unknowns):
         kept = frozenset(unknowns.table.names) & setup.keys()
-        values = guess_nuisance_values(data, T, _fix_nuisance(unknowns, setup), joints)
+        values = fit_nuisance_values(robot, data, T, _fix_nuisance(unknowns, setup), joints)
     return PosePredictions(T[None], joints, unknowns, values[None], kept)
 
 

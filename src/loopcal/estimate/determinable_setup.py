@@ -18,16 +18,11 @@ import numpy as np
 
 from loopcal.errors import LoopcalError, MechanismError
 from loopcal.estimate.free_parameters import choose_pivots
-from loopcal.estimate.pose_estimate import predict_from_readings
+from loopcal.estimate.pose_estimate import fit_nuisance_values, predict_from_readings
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
 from loopcal.geometry import exp_so3, log_so3
-from loopcal.measure.initial_values import (
-    evaluate_measurements,
-    find_equal_values,
-    guess_nuisance_values,
-    whiten_rows,
-)
+from loopcal.measure.initial_values import evaluate_measurements, find_equal_values, whiten_rows
 from loopcal.measure.kinds.setup_parameters import POSITION_AXES, ROTATION_AXES
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.nuisance import StatedValue
@@ -108,7 +103,8 @@ def report_equal_setup(fit: Identification, data: Measurements) -> list[Finding]
     local = part.nuisance_parameters
     if any(rows.kind.sensed_joints for rows in part.all_observations) or not len(T):
         return []
-    places = np.array([setup.names.index(name) for name in local.table.names], dtype=np.int64)
+    place_of = {name: i for i, name in enumerate(setup.names)}
+    places = np.array([place_of[name] for name in local.table.names], dtype=np.int64)
     values, sd = setup.estimate[places], setup.sd[places]
     others = find_equal_values(part, T, local, values)
     owners: dict[str, list[int]] = defaultdict(list)
@@ -247,7 +243,7 @@ def _is_misplaced(robot: Mechanism, data: Measurements, fixed: Measurements) -> 
         part = part.take(solution.converged & known)
         T = solution.T[solution.converged & known]
         try:
-            values = guess_nuisance_values(part, T)
+            values = fit_nuisance_values(robot, part, T)
         except LoopcalError:  # too few rows for a start
             return False
         evaluated = evaluate_measurements(part, T[None], values[None])

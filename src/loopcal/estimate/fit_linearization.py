@@ -151,9 +151,7 @@ def linearize_at_estimate(
         fit.pose_weights
     )
     z = problem.free.deviation(fit.robot.values[None])
-    start = problem.start(z, seek=False)
-    if problem.nuisance is not None:
-        start = start.with_nuisance(fit.nuisance.estimate[None])
+    start = problem.start(z, seek=False).with_nuisance(fit.nuisance.estimate[None])
     if solution is None:
         kept = 6 * data.n_poses * len(problem.free) <= MOST_KEPT  # or computed when needed
         solution = problem.solve(z, start, derivatives=kept)

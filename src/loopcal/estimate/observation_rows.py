@@ -12,7 +12,8 @@ import numpy as np
 
 from loopcal.measure.array_checks import drop_repeats
 from loopcal.measure.kinds.kind import Kind, MeasuredColumns
-from loopcal.measure.measurements import Measurements
+from loopcal.measure.measurements import Measurements, anchor_rows
+from loopcal.measure.nuisance import NuisanceParameters
 from loopcal.numerics.elimination import find_connected_groups
 from loopcal.numerics.statistics import find_distinct
 from loopcal.typing import BoolArray, FloatArray, IntArray
@@ -161,6 +162,22 @@ class ObservationRows:
         linked = np.sqrt(weight)[..., self.poses_by_link]
         each = linked.prod(axis=-1) ** (1.0 / linked.shape[-1])
         return replace(self, whitener=self.whitener * np.atleast_2d(each)[:, :, None, None])
+
+
+def list_rows(data: Measurements, nuisance: NuisanceParameters) -> tuple[ObservationRows, ...]:
+    """Return the rows of one machine's measurements, those of targets on the base last."""
+    return tuple(
+        ObservationRows(
+            o.kind,
+            anchor_rows(o, data.observations) if o.kind.is_of_base else o.rows,
+            o.measured[None],
+            o.whitener[None],
+            nuisance.indices[i],
+            nuisance.factor(i),
+        )
+        for i, o in enumerate(data.all_observations)
+        if len(o)
+    )
 
 
 def whiten(whitener: FloatArray, residual: FloatArray) -> FloatArray:

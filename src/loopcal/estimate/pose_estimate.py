@@ -8,7 +8,7 @@ the stroke or on another branch than home's, so that nobody takes it for a measu
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import compress
 from typing import Any, NamedTuple
@@ -17,16 +17,20 @@ import numpy as np
 
 from loopcal.errors import EstimationError
 from loopcal.estimate.free_parameters import fix_all
-from loopcal.estimate.linearization import PoseEstimates
-from loopcal.estimate.problem import Problem, problem_of
+from loopcal.estimate.linearization import LinearizedPoses, PoseEstimates
+from loopcal.estimate.observation_rows import list_rows
+from loopcal.estimate.pose_rows import PoseSearch
+from loopcal.estimate.problem import Problem, make_exact_problem, problem_of
 from loopcal.findings import Finding, Quantity, report_finding
 from loopcal.geometry import wrap_angle
 from loopcal.measure.data_checks import find_outside_strokes
+from loopcal.measure.initial_values import guess_nuisance_values
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.nuisance import NuisanceParameters
 from loopcal.measure.readings import fill_in_reading_sigma
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.solutions import Solution, forward, inverse, make_solution
+from loopcal.numerics.gauss_newton import Halving
 from loopcal.parameters import ParameterTable
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension
@@ -240,6 +244,45 @@ def fit_poses(
         (problem.poses.component_count[0] - estimates.rank[0])[member],
         problem.residuals(z, fitted)[-1].whitened[0],
     )
+
+
+NUISANCE_CONTROL = Halving(absolute=1e-6)
+
+
+def fit_nuisance_values(
+    robot: Mechanism,
+    data: Measurements,
+    T: FloatArray,
+    nuisance: NuisanceParameters | None = None,
+    joints: Mapping[str, FloatArray] | None = None,
+) -> FloatArray:
+    """Return values (U,) of the nuisance parameters that fit the measurements at given poses.
+
+    T : (n, 4, 4) T_base_platform of each pose, usually of the nominal robot at the readings.
+    nuisance : with priors and fixed values; default: `data.nuisance_parameters`.
+    joints : name -> (1, n) of joints that kinds sense.
+    DataError : the poses are too few or too similar to determine a parameter.
+    """
+    own = data.nuisance_parameters if nuisance is None else nuisance
+    if not own.table.free.any():
+        return own.values()
+    measured = [o.measured[None] for o in data.all_observations]
+    begin = guess_nuisance_values(data, measured, T[None], own)
+    readings, rows, z = data.readings[None], list_rows(data, own), np.zeros((1, 0))
+    poses = make_exact_problem(fix_all(robot), readings, rows, 1, own, lambda _: data).poses
+    located = [
+        LinearizedPoses(
+            T[None, of],
+            np.ones((1, len(of)), dtype=bool),
+            np.zeros((1, len(of), 6, 0)),
+            {name: value[:, of] for name, value in (joints or {}).items()},
+        )
+        for of in (block.poses for block in poses.blocks)
+    ]
+    search = PoseSearch(poses, z, np.zeros(1, dtype=np.int64), True, located)
+    found = search.minimize(None, begin, NUISANCE_CONTROL)[0].nuisance
+    assert found is not None
+    return found[0]
 
 
 def refuse_unreached(data: Measurements, lost: IntArray) -> None:

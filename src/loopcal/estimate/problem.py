@@ -47,7 +47,7 @@ from loopcal.estimate.linearization import (
     evaluate_rows,
     spread_states,
 )
-from loopcal.estimate.observation_rows import TRIAL_BLOCK, ObservationRows, Residuals
+from loopcal.estimate.observation_rows import TRIAL_BLOCK, ObservationRows, Residuals, list_rows
 from loopcal.estimate.pose_coordinates import (
     MeasuredPoses,
     PoseCoordinates,
@@ -55,7 +55,7 @@ from loopcal.estimate.pose_coordinates import (
     TwistCoordinates,
 )
 from loopcal.estimate.pose_rows import BLOCK, PoseBlock, PoseRows, find_components
-from loopcal.measure.initial_values import guess_nuisance_values_batch
+from loopcal.measure.initial_values import guess_nuisance_values
 from loopcal.measure.kinds.kind import Evaluation, Kind
 from loopcal.measure.measurements import Measurements, anchor_rows
 from loopcal.measure.nuisance import NuisanceParameters
@@ -305,7 +305,7 @@ class Problem:
                 measured = [rows.measured[None] for rows in data.all_observations]
                 # by groups of rows; the fit begins with the best values of all rows together
                 local = self.nuisance.local
-                found = guess_nuisance_values_batch(data, measured, located[0][None], local)
+                found = guess_nuisance_values(data, measured, located[0][None], local)
                 return start.with_nuisance(found)
         return start
 
@@ -476,6 +476,7 @@ class Problem:
             for _, node_rows, lost in poses.iterate_rows(solution, z, trials):
                 factor = fold_node_rows(factor, factors, node_rows)
                 is_lost |= lost
+                del node_rows  # else the last ones stay in memory
         equations = self.residual_count
         if solution.estimates is not None:
             equations = equations - solution.estimates.rank.sum(axis=1)
@@ -525,18 +526,7 @@ def problem_of(
     parameters of the measurements, default as stated there.
     """
     nuisance = data.nuisance_parameters if stated is None else stated
-    rows = tuple(
-        ObservationRows(
-            o.kind,
-            anchor_rows(o, data.observations) if o.kind.is_of_base else o.rows,
-            o.measured[None],
-            o.whitener[None],
-            nuisance.indices[i],
-            nuisance.factor(i),
-        )
-        for i, o in enumerate(data.all_observations)
-        if len(o)
-    )
+    rows = list_rows(data, nuisance)
     return make_problem(
         free, data.readings[None], data.reading_sigma, rows, 1, nuisance, lambda _: data
     )

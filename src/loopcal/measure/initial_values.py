@@ -2,9 +2,8 @@
 """Initial values of nuisance parameters, from the data and the poses of the nominal robot.
 
 Each kind offers candidates (`Kind.guess_values`) for the rows that share its parameters. Damped
-Gauss-Newton on these rows, at fixed poses, refines every candidate. The best one is kept, and a
-last descent uses all rows together. Parameters with a prior and fixed ones begin at their nominal
-values.
+Gauss-Newton on these rows, at fixed poses, refines every candidate, and the best one is kept.
+Parameters with a prior and fixed ones begin at their nominal values.
 """
 
 from __future__ import annotations
@@ -25,8 +24,7 @@ from loopcal.measure.nuisance import NuisanceParameters
 from loopcal.measure.observations import Observations, whiten_columns
 from loopcal.numerics.elimination import find_connected_groups
 from loopcal.numerics.gauss_newton import GOOD_START, STEPS, minimize_from_starts, sum_squares
-from loopcal.numerics.statistics import choose_evenly, find_distinct, find_distinct_rows
-from loopcal.parameters import ParameterTable
+from loopcal.numerics.statistics import choose_evenly, find_distinct_rows
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
 # Sum of squares, in variances of the noise, by which one solution fits better than another without
@@ -129,28 +127,6 @@ def whiten_rows(
 
 
 def guess_nuisance_values(
-    measurements: Measurements,
-    T: FloatArray,
-    nuisance: NuisanceParameters | None = None,
-    joints: Mapping[str, FloatArray] | None = None,
-) -> FloatArray:
-    """Return values (U,) of the nuisance parameters that fit the measurements at given poses.
-
-    T : (n, 4, 4) T_base_platform of each pose, usually of the nominal robot at the readings.
-    nuisance : with priors and fixed values; default: `measurements.nuisance_parameters`.
-    joints : name -> (1, n) of joints that kinds sense.
-    DataError : the poses are too few or too similar to determine a parameter.
-    """
-    collected = measurements.nuisance_parameters if nuisance is None else nuisance
-    if not collected.table.free.any():
-        return collected.values()
-    values = guess_nuisance_values_batch(
-        measurements, [o.measured[None] for o in measurements.all_observations], T[None], collected
-    )[0]
-    return _refine_together(measurements, T, collected, values, joints)
-
-
-def guess_nuisance_values_batch(
     measurements: Measurements,
     measured: Sequence[FloatArray],
     T: FloatArray,
@@ -425,59 +401,3 @@ def _collect_candidates(
         offered.append(candidates)
     k = max(len(guesses) for guesses in offered)
     return np.stack([np.concatenate([g, np.repeat(g[-1:], k - len(g), axis=0)]) for g in offered])
-
-
-def _refine_together(
-    measurements: Measurements,
-    T: FloatArray,
-    nuisance: NuisanceParameters,
-    values: FloatArray,
-    joints: Mapping[str, FloatArray] | None,
-) -> FloatArray:
-    """Return values (U,) after a descent over all rows and priors, one cluster after the other."""
-    cluster, refined = _find_clusters(nuisance), values.copy()
-    members = [cluster[used].max(axis=1, initial=-1) for used in nuisance.indices]
-    for c in range(int(cluster.max(initial=-1)) + 1):
-        listed: dict[bool, list[Observations]] = {False: [], True: []}
-        places, factors = [], []
-        for i, (rows, member) in enumerate(
-            zip(measurements.all_observations, members, strict=True)
-        ):
-            chosen, factor = np.flatnonzero(member == c), nuisance.factor(i)
-            if len(chosen):
-                listed[rows.kind.is_of_base].append(rows.take(chosen))
-                places.append(nuisance.indices[i][chosen])
-                factors.append(None if factor is None else factor[chosen])
-        used = find_distinct(np.concatenate([array.ravel() for array in places]))
-        entries = tuple(nuisance.table.entries[i] for i in used)
-        own = tuple(np.searchsorted(used, array) for array in places)
-        part = replace(
-            measurements, observations=tuple(listed[False]), base_observations=tuple(listed[True])
-        )
-        local = NuisanceParameters(ParameterTable(entries), own, tuple(factors))
-        refined[used] = _refine_cluster(part, T, local, values[used], joints)
-    return refined
-
-
-def _refine_cluster(
-    measurements: Measurements,
-    T: FloatArray,
-    nuisance: NuisanceParameters,
-    values: FloatArray,
-    joints: Mapping[str, FloatArray] | None,
-) -> FloatArray:
-    """Return values (U,) of the parameters of one cluster after a descent from given ones."""
-    no_motion = np.zeros((1, len(T), 6, 0))
-    weight = np.where(nuisance.table.free, 1.0 / nuisance.table.tolerance, 0.0)
-    prior = np.diag(np.nan_to_num(weight, nan=0.0))
-
-    def whiten(x: FloatArray, which: IntArray) -> tuple[FloatArray, FloatArray]:
-        rows = whiten_rows(
-            evaluate_measurements(measurements, T[None], x, nuisance, joints), no_motion
-        )
-        e = np.concatenate([rows[..., -1], (x - nuisance.table.nominal) @ prior], axis=1)
-        return e, np.concatenate(
-            [rows[..., :-1], np.broadcast_to(prior, (len(x), *prior.shape))], axis=1
-        )
-
-    return minimize_from_starts(whiten, values[None])[0][0]

@@ -265,7 +265,8 @@ class NodeFactors:
         """Fold all rows into the factors."""
         for structure in sorted({part.structure for part in self._rows}):
             own = [part for part in self._rows if part.structure == structure]
-            rows = np.concatenate([fill_rows(part, self.tree) for part in own], axis=1)
+            filled = [fill_rows(part, self.tree) for part in own]
+            rows = filled[0] if len(filled) == 1 else np.concatenate(filled, axis=1)
             places = np.concatenate([p.places.repeat(p.machine.shape[2]) for p in own])
             self._factors[structure] = fold_at(self._factors[structure], rows, places)
         self._rows = []
@@ -613,6 +614,7 @@ def _carry_inwards(
 
 # Numbers of rows that are kept, about, before they are folded.
 KEPT = 4_000_000
+FOLDED = 500_000  # numbers that are folded by one call
 
 
 def fold_at(factor: FloatArray, rows: FloatArray, places: IntArray) -> FloatArray:
@@ -623,10 +625,13 @@ def fold_at(factor: FloatArray, rows: FloatArray, places: IntArray) -> FloatArra
     first = np.cumsum(count) - count
     out = _with_height(factor, min(w, used + int(count.max(initial=0))))
     for number in find_distinct(count[count > 0]):  # nodes with as many new rows together
-        nodes = np.flatnonzero(count == number)
-        own = rows[:, order[first[nodes][:, None] + np.arange(number)]]
-        triangles = np.linalg.qr(np.concatenate([factor[:, nodes], own], axis=2), mode="r")
-        out[:, nodes, : triangles.shape[2]] = triangles
+        alike = np.flatnonzero(count == number)
+        size = max(1, FOLDED // (len(rows) * (used + int(number)) * w))
+        for nodes in np.split(alike, range(size, len(alike), size)):
+            own = rows[:, order[first[nodes][:, None] + np.arange(number)]]
+            whole = np.concatenate([factor[:, nodes], own], axis=2)
+            triangles = np.asarray(np.linalg.qr(whole, mode="r"))
+            out[:, nodes, : triangles.shape[2]] = triangles
     return out
 
 

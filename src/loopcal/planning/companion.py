@@ -34,7 +34,7 @@ from loopcal.errors import DataError
 from loopcal.estimate.information import ObservedPoses, observe_poses, observe_rows
 from loopcal.estimate.residual_test import FEWEST_DEGREES, NO_NOISE, SIGNIFICANCE
 from loopcal.findings import Finding, report_finding
-from loopcal.measure.initial_values import guess_nuisance_values_batch
+from loopcal.measure.initial_values import guess_nuisance_values
 from loopcal.measure.instrument import Instrument
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.readings import resolve_reading_sigma
@@ -320,7 +320,7 @@ def _locate_setup(task: CompanionTask, measured: Measurements, x: FloatArray) ->
         T, nuisance = observe_poses(free, chosen.readings).T, chosen.nuisance_parameters
         values = [rows.measured[None] for rows in chosen.observations]
         with suppress(DataError):  # all points on one line, of which two are enough
-            return np.append(guess_nuisance_values_batch(chosen, values, T, nuisance)[0], z)
+            return np.append(guess_nuisance_values(chosen, values, T, nuisance)[0], z)
     return x
 
 

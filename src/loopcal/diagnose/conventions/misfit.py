@@ -38,7 +38,7 @@ from loopcal.estimate.penalties import Ridge
 from loopcal.estimate.problem import Problem, make_exact_problem, make_problem, problem_of
 from loopcal.estimate.resampling import CenteredProblem
 from loopcal.findings import Finding, Quantity, report_finding
-from loopcal.measure.initial_values import guess_nuisance_values_batch
+from loopcal.measure.initial_values import guess_nuisance_values
 from loopcal.measure.kinds.kind import Column, Kind
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.nuisance import NuisanceParameters
@@ -327,7 +327,7 @@ def _linearize(
                     present = np.any(rows.whitener[0] != 0.0, axis=(1, 2))
                     weighted = observations[i].with_weights(present * observations[i].weight)
                     observations[i] = weighted
-            start = guess_nuisance_values_batch(
+            start = guess_nuisance_values(
                 replace(data, observations=tuple(observations)),
                 measured,
                 forward_trials(robot, robot.values[None], data.readings[None]).T,
@@ -406,7 +406,7 @@ def guess_frames(
     T[reached] = forward_trials(robot, robot.values[None], readings[reached][None]).T[0]
     measured = [np.broadcast_to(o.measured, (h, *o.measured.shape)) for o in data.observations]
     most, steps = QUICK.candidates, QUICK.guess_steps
-    start = guess_nuisance_values_batch(data, measured, T, nuisance, most=most, steps=steps)
+    start = guess_nuisance_values(data, measured, T, nuisance, most=most, steps=steps)
     sizes = [np.zeros((h, 0))]
     for o, places in zip(data.observations, nuisance.indices, strict=True):
         if len(o) and not o.kind.sensed_joints:
