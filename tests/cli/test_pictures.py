@@ -61,6 +61,16 @@ def photographed(tmp_path_factory) -> Path:
     return folder
 
 
+@pytest.fixture
+def calibrated(photographed, loopcal, monkeypatch) -> lc.Run:
+    """Go to the folder, and return the calibration by its pictures, made once for all tests."""
+    monkeypatch.chdir(photographed)
+    if not Path("plain").exists():
+        loopcal("photos pictures --board board.yaml --poses poses.csv -o plain.csv")
+        loopcal("calibrate hexapod-42 plain.csv -o plain", code=(0, 2))
+    return lc.load_run("plain")
+
+
 @pytest.mark.slow
 def test_photos_become_a_measurement_file_that_calibrates(
     photographed, loopcal, monkeypatch
@@ -125,20 +135,15 @@ def test_page_leads_from_the_board_to_a_calibration(
 
 
 @pytest.mark.slow
-def test_measured_lengths_correct_a_board_printed_at_97_percent(
-    photographed, loopcal, monkeypatch
-) -> None:
+def test_measured_lengths_correct_a_board_printed_at_97_percent(calibrated, loopcal) -> None:
     """The file says squares of 12 mm / 0.97, and the caliper what the printer made of them."""
-    monkeypatch.chdir(photographed)
     text = Path("board.yaml").read_text("utf-8")
     text = text.replace("square: 12 mm", f"square: {12 / 0.97} mm")
     Path("shrunk.yaml").write_text(text.replace("marker: 9 mm", f"marker: {9 / 0.97} mm"))
     loopcal("photos pictures --board shrunk.yaml --poses poses.csv -o shrunk.csv")
-    loopcal("photos pictures --board board.yaml --poses poses.csv -o plain.csv")
-    for name in ("plain", "shrunk"):
-        loopcal(f"calibrate hexapod-42 {name}.csv -o {name}", code=(0, 2))
-    plain, shrunk = (lc.load_run(name) for name in ("plain", "shrunk"))
-    assert np.abs(shrunk.robot.values - plain.robot.values).max() < 2e-6  # [m, rad]
+    loopcal("calibrate hexapod-42 shrunk.csv -o shrunk", code=(0, 2))
+    found = lc.load_run("shrunk").robot.values
+    assert np.abs(found - calibrated.robot.values).max() < 2e-6  # [m, rad]
     assert "board.scale_x: {start: -30000 ppm," in Path("shrunk.csv").read_text("utf-8")
 
 
@@ -156,10 +161,7 @@ def test_column_picture_of_the_poses_names_files_and_stays_in_the_table(
 
 
 @pytest.mark.slow
-def test_board_caliper_and_readings_in_inches_make_the_same_machine(
-    photographed, loopcal, monkeypatch
-) -> None:
-    monkeypatch.chdir(photographed)
+def test_board_caliper_and_readings_in_inches_make_the_same_machine(calibrated, loopcal) -> None:
     text = Path("board.yaml").read_text("utf-8")
     inches = re.sub(r"([\d.]+) mm", lambda m: f"{float(m[1]) / 25.4!r} in", text)
     Path("inches.yaml").write_text(inches)
@@ -167,12 +169,10 @@ def test_board_caliper_and_readings_in_inches_make_the_same_machine(
     cells = [row.split(",") for row in rows]
     lines = [",".join([name, *(f"{float(x) / 25.4!r}" for x in q)]) for name, *q in cells]
     Path("inch.csv").write_text("\n".join([head.replace("[mm]", "[in]"), *lines]) + "\n")
-    for name, table in (("board", "poses"), ("inches", "inch")):
-        words = f"photos pictures --board {name}.yaml --poses {table}.csv -o {name}-points.csv"
-        loopcal(words)
-        loopcal(f"calibrate hexapod-42 {name}-points.csv -o of-{name}", code=(0, 2))
-    millimeters, inches = (lc.load_run(f"of-{name}").robot.values for name in ("board", "inches"))
-    np.testing.assert_allclose(inches, millimeters, rtol=0, atol=1e-8)  # [m, rad]
+    loopcal("photos pictures --board inches.yaml --poses inch.csv -o inches.csv")
+    loopcal("calibrate hexapod-42 inches.csv -o inches", code=(0, 2))
+    found = lc.load_run("inches").robot.values
+    np.testing.assert_allclose(found, calibrated.robot.values, rtol=0, atol=1e-8)  # [m, rad]
     loopcal("board -o half.yaml --columns 6 --rows 5 --square 0.5in", "Measure 76.2 mm")
     half = Path("half.yaml").read_text("utf-8").replace("# measured", "measured")
     half = re.sub("76.20 mm, 63.50 mm", "2.997 in, 2.503 in", half)
