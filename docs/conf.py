@@ -31,8 +31,8 @@ root_doc = "docs/README"
 include_patterns = ["docs/**", "README.md", "ARCHITECTURE.md", "CHANGELOG.md", "CONTRIBUTING.md",
                     "SECURITY.md", "benchmarks/README.md", "evidence/README.md", "native/README.md",
                     "examples/*/README.md"]  # fmt: skip
-exclude_patterns = [".*", "build", "dist", "runs", "src", "tests", "tools", "benchmarks",
-                    "constraints", "docs/gallery", "docs/evidence"]  # fmt: skip
+exclude_patterns = [".*", "build", "dist", "runs", "src", "tests", "tools", "constraints",
+                    "docs/gallery", "docs/evidence"]  # fmt: skip
 smartquotes = False  # `--hold-out` keeps its hyphens
 default_role = "py:obj"  # names in single backticks, as the docstrings have them
 

@@ -11,7 +11,7 @@ import enum
 import inspect
 import re
 import sys
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -43,7 +43,8 @@ HEAD = """\
 `import loopcal as lc` gives these names, and no other name is public. Inside, all numbers are SI:
 meters and radians. Arrays have the poses first; `T` has shape (n, 4, 4) and maps platform
 coordinates to base coordinates. Terms are in the [glossary](glossary.md). `help(lc.NAME)` shows
-shapes, units and errors. This page is made from the code by `make docs`.
+shapes, units and errors. A function comes with the classes of its options and result, `Kind` with
+the [kinds](files.md#settings).
 """
 
 
@@ -54,7 +55,13 @@ def write_page() -> str:
         raise SystemExit(f"SECTIONS lacks {set(names) - set(SECTIONS)}")
     sections = [HEAD]
     for package, heading in SECTIONS.items():
-        rows = [(f"`{name}`", describe_name(name)) for name in names[package]]
+        results = {name: find_results(name, names[package]) for name in names[package]}
+        with_function = {result for found in results.values() for result in found}
+        rows = [
+            (", ".join(f"`{name}`" for name in (first, *found)), describe_name(first))
+            for first, found in results.items()
+            if first not in with_function
+        ]
         sections.append(f"\n## {heading}\n\n{format_table(('name', 'purpose'), rows)}")
     return "".join(sections)
 
@@ -73,6 +80,22 @@ def list_names() -> dict[str, list[str]]:
     }
 
 
+def find_results(name: str, names: Collection[str]) -> tuple[str, ...]:
+    """Return the names of a package that belong to one of them: the classes of the options and
+    result of a function, and the kinds, which docs/files.md describes, of `Kind`.
+    """
+    value = getattr(loopcal, name)
+    if value is loopcal.Kind:
+        return tuple(name for name in names if getattr(loopcal, name) in loopcal.KINDS.values())
+    if not inspect.isfunction(value):
+        return ()
+    signature = inspect.signature(value)
+    options = signature.parameters.get("options")
+    annotations = [options.annotation if options else "", signature.return_annotation]
+    found = [str(annotation).removesuffix(" | None") for annotation in annotations]
+    return tuple(result for result in found if result in names)
+
+
 def describe_name(name: str) -> str:
     """Return the first sentence of a public name's docstring."""
     value: Any = getattr(loopcal, name)
@@ -84,7 +107,7 @@ def describe_name(name: str) -> str:
     paragraph = " ".join(text.split("\n\n")[0].split())
     sentence = re.split(r"(?<=[.!?]) (?=[A-Z`])", paragraph)[0]
     members = ""
-    if isinstance(value, enum.EnumMeta):
+    if isinstance(value, enum.EnumMeta) and len(value) < 10:
         members = f" ({', '.join(value.__members__)})"
     return sentence.rstrip(".") + members + "."
 

@@ -54,6 +54,8 @@ SECTIONS = {
     "Uncertain readings": "reading_noise",
 }
 """Section of the page -> the settings that it describes."""
+SHOWN_EXAMPLES = 4  # of a kind
+SETUP_PARAMETERS = re.compile(r" Setup parameters: .*")  # the page has a table of all
 BLOCK = r"made by tools.file_reference: (?P<name>[\w-]+)"
 
 
@@ -195,8 +197,9 @@ def format_kinds() -> str:
         shown: dict[tuple[str, ...], tuple[str, str, str]] = {}  # of equal columns the first
         for example in map(_describe_example, filter(_has_one_target, kind.examples())):
             shown.setdefault(example[1:], example)
-        examples = list(shown.values())
-        parts = [f"### `kind: {name}`\n\n{summarize(kind)}\n"]
+        examples = list(shown.values())[:SHOWN_EXAMPLES]
+        summary = SETUP_PARAMETERS.sub("", summarize(kind))
+        parts = [f"### `kind: {name}`\n\n{summary}\n"]
         if len(examples) > 1:
             parts += [format_table(("settings", "columns", "noise of, if of others"), examples)]
         elif any(examples[0]):
@@ -318,10 +321,17 @@ def format_study() -> str:
 
 
 def format_scores() -> str:
-    """Return the columns of the results of trials."""
-    columns = list_columns(Scores(verdict=True))
-    rows = [(f"`{c.name}`", "" if c.unit == "1" else c.unit, c.meaning) for c in columns]
-    return format_table(("score", "unit", "meaning"), rows)
+    """Return the columns of the results of trials; root mean square and largest value together."""
+    columns = {column.name: column for column in list_columns(Scores(verdict=True))}
+    rows = []
+    for name, column in columns.items():
+        if name.removesuffix("_max") in columns and name.endswith("_max"):
+            continue
+        unit = "" if column.unit == "1" else f" [{column.unit}]"
+        largest = f"{name}_max" in columns
+        names = f"`{name}`, `{name}_max`" if largest else f"`{name}`"
+        rows.append((names + unit, column.meaning + " and largest" * largest))
+    return format_table(("score", "meaning"), rows)
 
 
 BLOCKS = {

@@ -22,7 +22,7 @@ WORDING = ROOT / "tests" / "findings" / "wording.txt"
 SENTENCE_END = re.compile(r"(?<=[.?]) (?=[A-Z`'{]|loopcal)")
 PLACEHOLDER = re.compile(r"\{(?P<name>\w+)[^{}]*\}")
 WORD = re.compile(r"(?:\*[^*]*\*|`[^`]*`|[^\s*`])+")
-SHOWN_WORDS = 6  # of the first sentence of a message
+SHOWN_WORDS = 5  # of the first sentence of a message
 SEVERITIES = {
     Severity.INFO: "worth knowing. The result is usable as it is",
     Severity.SUGGESTION: "a step that would improve the result",
@@ -57,8 +57,11 @@ def describe_text(entry: Entry) -> str:
 
 
 def describe_circumstances(entry: Entry) -> str:
-    """Return when an entry is reported and what to do, as far as its text does not say it."""
-    return f"{entry.when} {fill_template(entry.action, **entry.example)}".strip()
+    """Return when an entry is reported and what to do, as far as its message does not say it."""
+    subject, is_suggestion = entry.code.split(".")[0], entry.severity is Severity.SUGGESTION
+    is_printed = subject == "study" or (subject == "conventions" and is_suggestion)
+    action = "" if is_printed else fill_template(entry.action, **entry.example)
+    return f"{entry.when} {action}".strip()
 
 
 def list_codes(entries: Iterable[Entry]) -> str:

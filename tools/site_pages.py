@@ -31,7 +31,8 @@ LINE = re.compile(r"^(?:\||[*-]) .*$", re.MULTILINE)
 LINK = re.compile(r"\]\(([^)#]+\.(?:md|rst))\)")
 """A line of a table or of a list, and a link to a page."""
 
-API_ROW = re.compile(r"^\| `(\w+)` \|", re.MULTILINE)
+API_ROW = re.compile(r"^\| `\w+`(?:, `\w+`)* \|", re.MULTILINE)
+API_NAME = re.compile(r"`(\w+)`")
 COMMAND_ROW = re.compile(r"^\| (`loopcal ([\w-]+)[^`]*`) \|", re.MULTILINE)
 """A name in a table of docs/api.md, and a command in the table of docs/commands.md."""
 
@@ -51,7 +52,7 @@ def add_contents(app: Any, page: str, source: list[str]) -> None:
     del app
     text = source[0]
     if page == "docs/api":
-        text = API_ROW.sub(r"| {py:obj}`\1 <loopcal.\1>` |", text)
+        text = API_ROW.sub(lambda row: API_NAME.sub(r"{py:obj}`\1 <loopcal.\1>`", row[0]), text)
         text += format_contents(
             "", [f"generated/api/{name}.rst" for name in map(name_page, SECTIONS)]
         )

@@ -64,8 +64,8 @@ class InstrumentLevel(Limited):
         length and each angle, by default 10 um and 50 urad.
     unknown_frames : which of "base" and "tool" the fit estimates. distribution : of the noise. A
         sigma is its standard deviation, so uniform noise lies within sqrt(3) of it.
-    unused : measured columns that the fit does not get, such as psi. The noise of the others is as
-        without it, so a study compares such instruments on equal measurements.
+    unused : measured columns that the fit does not get, such as psi, for a comparison on equal
+        measurements.
     """
 
     LIMITS: ClassVar[Mapping[str, Limit]] = {
@@ -95,11 +95,9 @@ class NoiseLevel(Limited):
 class PosesLevel(Limited):
     """The measured poses.
 
-    count : number of poses. choice : "random" draws them evenly from the workspace, "planned" plans
-        them for the robot and the instrument, "tilts" puts them on three rings of equal tilt,
-        "plane-line" on planes and perpendicular lines for an instrument of the kinds plane and
-        line. seed : of the draw or the plan (default: of the study). Every trial of a cell measures
-        these poses.
+    count : number of poses. choice : "random" in the workspace, "planned" for the robot and the
+        instrument, "tilts" on three rings of equal tilt, or "plane-line" on planes and
+        perpendicular lines. seed : of the draw or the plan (default: of the study).
     groups : planes with a line each, for "plane-line". count is the number of all their points.
     axis : along which their lines run. sweeps : of the coordinate exchange that improves the points
         (0: as drawn).
@@ -188,17 +186,17 @@ class MethodLevel(Limited):
         0.01, "*.length": 1}`, see `Ridge.resolve`. keep : directions of truncated-svd. Without
         them cross-validation chooses both.
     loss, noise : as in `FitOptions`.
-    rows : "raw" gives all rows and parameters the weight one in millimeters and radians, takes full
-        steps and filters the step, as published studies do; least-squares then has no rank
-        detection, and ridge and truncated-svd need `lam` and `keep`. "products" takes products of
-        points on planes and lines with their covariance, "products-printed" with the weight one, as
-        another study does, "products-distance" as distances from the plane, and "products-single"
-        with their own variances. For comparisons.
+    rows : for comparisons. "raw" gives all rows and parameters the weight one in millimeters and
+        radians, takes full steps and filters the step, as published studies do. Least-squares then
+        has no rank detection, and ridge and truncated-svd need `lam` and `keep`. "products" takes
+        products of points on planes and lines with their covariance, "products-printed" with the
+        weight one, "products-distance" as distances from the plane, "products-single" with their
+        own variances.
     epsilon : limit at which raw and per-leg fits end: of the largest component of a step [mm, rad]
-        for raw fits (1e-6 by default), of what `stop` names for per-leg. steps : of these fits, at
-        most, or without epsilon exactly (3 by default for per-leg).
+        (raw fits, 1e-6 by default), or of what `stop` names. steps : of these fits, at most, or
+        without epsilon exactly (3 by default for per-leg).
     stop : what epsilon limits of per-leg: "dQint", the default, is the largest error of a pose
-        after a step, position [mm] plus angle [rad]; "step" the largest component of a step.
+        after a step, position [mm] plus angle [rad]. "step" is its largest component.
     """
 
     PLAIN: ClassVar[str] = "method"
@@ -287,7 +285,7 @@ class MethodLevel(Limited):
 class Outliers(Limited):
     """`share` of the rows lie `size` sigmas off, in a random direction.
 
-    It means whole rows. If that is none, one row is off in as many of the trials.
+    If the share is less than one row, one row is off in as many of the trials.
     """
 
     LIMITS: ClassVar[Mapping[str, Limit]] = {
@@ -351,12 +349,10 @@ class Scores(Limited):
 
     held_out : number of poses for the errors, drawn from the workspace and not measured. frame : of
         the errors, "fitted" or "base", or "both": also errors in the base frame as further scores.
-    intervals : "stated" computes them from the stated noise, for all trials of a block at once.
-        "adjusted" computes them as a calibration does, which also uses what the residuals say about
-        the noise; trials are then fitted one by one, which takes longer.
-    verdict : calibrate every trial as `loopcal calibrate` does, with all its checks and with its
-        held-out poses measured, and record the verdict. It takes much longer, and the intervals are
-        adjusted ones. limit_position, limit_angle : limits of the verdict.
+    intervals : "stated" computes them from the stated noise, "adjusted" as a calibration does, with
+        the noise of the residuals, which takes longer.
+    verdict : calibrate every trial as `loopcal calibrate` does, with adjusted intervals, and record
+        the verdict. It takes much longer. limit_position, limit_angle : limits of the verdict.
     """
 
     LIMITS: ClassVar[Mapping[str, Limit]] = {"held_out": whole_numbers(1, 10_000)}
@@ -637,7 +633,6 @@ def describe_record(record: Any) -> dict[str, Any]:
 
 BLOCK, REPLICATES = 50, 1000
 """Trials of a block, and of a cell, by default."""
-
 
 MOST_TRIALS = 2000  # largest number of trials of a block
 

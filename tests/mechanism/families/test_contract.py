@@ -69,7 +69,7 @@ def test_sensitivities_are_the_derivatives_of_forward_kinematics(name: str) -> N
 
 
 def test_documentation_lists_every_robot_with_its_parameter_count() -> None:
-    """| name | family | .. | parameters | ..; the table has no others."""
+    """| name | family | .. | parameters |; the table has no others."""
     page = (Path(__file__).parents[3] / "docs" / "robots.md").read_text("utf-8")
     table = page[page.index("| name | family |") :].split("\n\n")[0]
     rows = [
@@ -77,5 +77,5 @@ def test_documentation_lists_every_robot_with_its_parameter_count() -> None:
         for line in table.splitlines()[2:]
     ]
     assert sorted(row[0] for row in rows) == sorted(ROBOTS)
-    for name, _, _, _, parameters, _ in rows:
+    for name, _, _, _, parameters in rows:
         assert int(parameters) == len(load_cached_robot(name).parameters), name

@@ -81,13 +81,13 @@ def _format(value: float) -> str:
 
 
 YAML_SIZE = FileLimit(
-    "size of YAML text with its remarks: robot files, settings, profiles, loop closures",
+    "YAML text: robot files, settings, profiles, loop closures",
     1,
     "MB",
     "shorten its comments, or remove what does not belong there",
 )
 YAML_NODES = FileLimit(
-    "keys, values and lists of YAML text. An alias counts as all values that it stands for",
+    "keys, values and lists of YAML text, aliases written out",
     50_000,
     "values",
     "write less, or use fewer aliases",
@@ -100,7 +100,7 @@ YAML_DEPTH = FileLimit(
 )
 COPIES = FileLimit("`copies: {count: ..}` of a limb", MOST_COPIES, "copies")
 LIMBS = FileLimit("limbs of a robot, copies included", MOST_LIMBS, "limbs")
-JOINTS = FileLimit("joints of a limb. A universal joint counts as two", MOST_JOINTS, "joints")
+JOINTS = FileLimit("joints of a limb (a universal joint: two)", MOST_JOINTS, "joints")
 ACTUATORS = FileLimit("actuators of all limbs together", MOST_ACTUATORS, "actuators")
 PARAMETERS = FileLimit("parameters of a robot, fixed ones included", MOST_PARAMETERS, "parameters")
 NAME_LENGTH = FileLimit(
@@ -114,19 +114,16 @@ COMPOSED_LENGTH = FileLimit(
 )
 TEXT_LENGTH = FileLimit("`source` of a robot", 10_000, "characters", "shorten it")
 TABLE_SIZE = FileLimit(
-    "measurement files, exports of instruments, `result.json` of a run",
-    500,
-    "MB",
-    "divide it into several files",
+    "measurement files, exports, `result.json` of a run", 500, "MB", "divide it into several files"
 )
 TABLE_ROWS = FileLimit(
-    "rows of a measurement file below the header",
+    "rows of a measurement file",
     2_000_000,
     "rows",
     "divide it into several files, or average repeated measurements",
 )
 TABLE_LINES = FileLimit(
-    "lines of a measurement file, blank ones and remarks included",
+    "lines of a measurement file, with remarks",
     5_000_000,
     "lines",
     "remove other lines, or divide it into several files",
@@ -156,13 +153,10 @@ PATTERN_SECONDS = FileLimit(
     "the patterns of an export, and 0.1 ms more for each of its lines", 2, "seconds"
 )
 PROGRAM_SIZE = FileLimit(
-    "files of other programs that `loopcal import` and `loopcal export` read",
-    5,
-    "MB",
-    "check that this is the right file, or remove other content",
+    "files of other programs", 5, "MB", "check that this is the right file, or remove other content"
 )
 JSON_VALUES = FileLimit(
-    "`result.json` of a run and samples of a cable robot, keys included",
+    "JSON of a run or of a cable robot, with keys",
     25_000_000,
     "values",
     "check that this is the file that was meant",
@@ -177,7 +171,7 @@ XML_JOINTS = FileLimit(
     "leave out joints that belong to no loop",
 )
 XML_ELEMENTS = FileLimit(
-    "elements of a URDF of every kind",
+    "elements of a URDF",
     20_000,
     "elements",
     "leave out what loopcal does not read, such as visuals",
@@ -189,10 +183,7 @@ XML_DEPTH = FileLimit(
     "check that this is the file that was meant",
 )
 ARRAYS_SIZE = FileLimit(
-    "`arrays.npz` of a run folder, as a file and in memory, never compressed",
-    4_000,
-    "MB",
-    "repeat the calibration with fewer poses",
+    "`arrays.npz` of a run folder", 4_000, "MB", "repeat the calibration with fewer poses"
 )
 ARRAYS_COUNT = FileLimit("arrays in `arrays.npz`", 1_000, "arrays", "repeat the calibration")
 UPLOAD_SIZE = FileLimit("a file of `loopcal app`", 50, "MB", "divide it")

@@ -340,9 +340,8 @@ class Image(Kind):
     A row is one corner of one picture. The corner i of a board with c columns is at column `i mod
     c` and row `i div c`. The corner (0, 0) is the origin of the board, x runs along its columns and
     y along its rows. A printer scales both axes, and paper bends: with column and row h, k from -1
-    to 1, `p = (x (1 + scale_x), y (1 + scale_y), bend_x h^2 + bend_y k^2 + bend_xy h k)`. The model
-    of the camera is in `loopcal.measure.kinds.image`. Its z axis is the line of sight, x is right
-    and y down in the picture.
+    to 1, `p = (x (1 + scale_x), y (1 + scale_y), bend_x h^2 + bend_y k^2 + bend_xy h k)`. The
+    camera's z axis is the line of sight, x is right and y down in the picture.
 
     Setup parameters: `camera.rx` to `camera.z`, `board.rx` to `board.z` [rad, m], `camera.fx`,
     `cx`, `cy` [px], `aspect`, `k1`, `k2`, `k3`, `p1`, `p2`, `board.scale_x`, `board.scale_y`, and

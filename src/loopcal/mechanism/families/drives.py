@@ -195,9 +195,8 @@ class SpoolDrive(Sum, GivesLength):
     """A drive whose reading is an angle and moves a length.
 
     joint value = offset + radius * reading + buildup * reading^2 / (4 pi) + .. `radius` is the
-    length paid out per radian of the reading (spool radius with gears and tackle), negative if a
-    growing reading shortens; `buildup` is its growth in one turn of the reading. Their expected
-    spreads are `radii` and `buildups`.
+    length paid out per radian (with gears and tackle), negative if a growing reading shortens,
+    `buildup` its growth in one turn.
     """
 
     READING: ClassVar[Dimension] = Dimension.ANGLE
@@ -211,9 +210,7 @@ class SpoolDrive(Sum, GivesLength):
 
 @dataclass(frozen=True, kw_only=True)
 class ScrewDrive(Radii, Sum, GivesLength):
-    """A screw whose reading is its angle: it moves by `lead` in one turn, negative for a left-hand
-    one, with the expected spread `leads`.
-    """
+    """A screw whose reading is its angle: it moves by `lead` in one turn, negative if left-hand."""
 
     READING: ClassVar[Dimension] = Dimension.ANGLE
 
@@ -227,8 +224,7 @@ class TriangleDrive(Gain, GivesLength):
     """A linear actuator that turns a revolute joint through two anchors.
 
     The distance of the anchors is what a length drive gives. `unknown` may also name dimensions of
-    the triangle (foot.x, head.z, skew.rx; or foot, head and skew for all of one). Their
-    expected spreads are `length` and `angle`.
+    the triangle, such as foot.x, or foot for all of one.
     """
 
     reads: Literal["length"] = "length"
@@ -248,9 +244,8 @@ Drive = LengthDrive | AngleDrive | SpoolDrive | ScrewDrive | TriangleDrive
 
 @dataclass(frozen=True, kw_only=True)
 class Condition:
-    """A column of the data that no command sets: `temperature`, `temperature.PLACE` [degC],
-    `time` [s], or of the load `force.AXIS` [N], `moment.AXIS` [Nm]. Where none is given it has its
-    `reference`; simulations draw it from its `range`.
+    """A data column: `temperature`, `temperature.PLACE` [degC], `time` [s], `force.AXIS` [N] or
+    `moment.AXIS` [Nm]. It has its `reference` if none is given. Simulations draw from `range`.
     """
 
     reference: Ratio = 0.0
@@ -291,9 +286,7 @@ class CouplingRecord(Sum, RowRecord):
 @dataclass(frozen=True, kw_only=True)
 class AngleCoupling(CouplingRecord):
     """Gears, a belt or a differential between rotary joints: the sum of weight * joint value is
-    the `offset`. Joints are drives or passive joints `limb.joint`; `unknown` names weights and
-    offset. With a `condition` it is offset + slope * (condition - reference), the slope in units
-    of the sum per degC or second.
+    the `offset`, with a `condition` offset + slope * (condition - reference).
     """
 
     GIVEN: ClassVar[Dimension] = Dimension.ANGLE
@@ -306,7 +299,7 @@ class AngleCoupling(CouplingRecord):
 @dataclass(frozen=True, kw_only=True)
 class LengthCoupling(Radii, CouplingRecord):
     """A coupling of slides, and of rotary joints by a `radius` (joint -> length per radian), as of
-    a pinion on a rack. Unknown radii have the expected spread `radii`.
+    a pinion on a rack.
     """
 
     of: Literal["length"]

@@ -152,8 +152,7 @@ JointRecord = Revolute | Prismatic | Universal | Cylindrical | Spherical
 class Copies:
     """Copies of a limb, rotated about an axis of base and platform.
 
-    Its names end with the numbers 1, 2, .. Copy i has the rotation start + (i - 1) step. Without a
-    step the copies divide the full turn.
+    Copy i has the rotation start + (i - 1) step. Without a step they divide the full turn.
     """
 
     count: int
@@ -167,8 +166,8 @@ class Shifts:
     """Unknown lengths of a limb: positions of an element in its placed frame, or the rod's length.
 
     `of` is a joint, `tip` (in a limb without joints its first body, such as `base`), its second
-    body, such as `platform`, or `rod`. Parameters are called `limb.NAME.axis`, or `limb.NAME` for a
-    rod's length, with NAME = `of` unless `name` is given.
+    body, such as `platform`, or `rod`. Parameters are `limb.NAME.axis`, or `limb.NAME` for a rod's
+    length, with NAME = `of` by default.
     """
 
     of: str

@@ -64,8 +64,7 @@ class MapEntry:
     It is axis `axis` of the frame placed at `element` of `limb` (of all its copies). With `limb`
     the name of a drive, `element` is `transmission` and `axis` one of its terms. The displacement
     is coefficient * change, or arm * change for an angle or ratio that moves a length [arm per
-    radian]. `lead` is a screw's advance in one turn (`pitch`, the advance in a radian, is refused);
-    a `curve` counts per radian or meter.
+    radian]. `pitch` is refused: write `lead`. A `curve` counts per radian or meter.
     """
 
     limb: str
@@ -93,8 +92,8 @@ class NamedRecord:
 class NamedLength(NamedRecord):
     """A named parameter that is a length, with its nominal value.
 
-    `positive: true` says that no machine has it at zero or below, such as a radius. It is always so
-    where a nominal value above zero is mapped onto a rod's length, a lead or a gain.
+    `positive: true` says that no machine has it at zero or below. It is always so if a nominal
+    value above zero maps onto a rod's length, a lead or a gain.
     """
 
     GIVEN: ClassVar[Dimension] = Dimension.LENGTH
