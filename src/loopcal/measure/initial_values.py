@@ -23,7 +23,7 @@ from loopcal.measure.measurements import Measurements
 from loopcal.measure.nuisance import NuisanceParameters
 from loopcal.measure.observations import Observations, whiten_columns
 from loopcal.numerics.elimination import find_connected_groups
-from loopcal.numerics.gauss_newton import GOOD_START, STEPS, minimize_from_starts, sum_squares
+from loopcal.numerics.gauss_newton import STEPS, minimize_from_starts, sum_squares
 from loopcal.numerics.statistics import choose_evenly, find_distinct_rows
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
@@ -365,7 +365,7 @@ def _refine_candidates(
         refined, cost = candidates, np.zeros(len(candidates))
     else:
         refined, cost = minimize_from_starts(
-            lambda x, which: whiten(x, sets[which]), candidates, steps, GOOD_START, sets, worth
+            lambda x, which: whiten(x, sets[which]), candidates, steps, sets, worth
         )
     names = [parameter.name for parameter in kind.nuisance_parameters]
     shortest = shorten_rotations(names, refined)

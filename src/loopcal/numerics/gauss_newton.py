@@ -123,9 +123,9 @@ STEPS = 60  # steps of damped Gauss-Newton [1]; starts in the right basin need f
 FIRST_DAMPING, LARGEST_DAMPING = 1e-4, 1e4
 """Damping of the first step [1], in columns of length one, and that at which a descent ends."""
 
-# Step, in standard deviations or as a share of the residuals, that is as good as none; and one that
-# is short enough at the start of another descent: of shorter ones, rounding of the sums decides.
-NEGLIGIBLE_STEP, GOOD_START = 1e-6, 1e-4
+# Step, in standard deviations or as a share of the residuals, that is short enough at the start of
+# another descent: of shorter ones, rounding of the sums decides.
+GOOD_START = 1e-4
 SMALLEST = 1e-12  # singular value of columns of length one that counts as zero
 
 Linearize = Callable[[FloatArray, IntArray], tuple[FloatArray, FloatArray]]
@@ -134,25 +134,20 @@ standard deviation or of order one, and their Jacobians (c, M, u)."""
 
 
 def minimize_from_starts(
-    linearize: Linearize,
-    x: FloatArray,
-    steps: int = STEPS,
-    negligible: float = NEGLIGIBLE_STEP,
-    rivals: IntArray | None = None,
-    worth: float = np.inf,
+    linearize: Linearize, x: FloatArray, steps: int, rivals: IntArray, worth: float
 ) -> tuple[FloatArray, FloatArray]:
     """Minimize sums of squares from starts x (c, u) at once, by damped Gauss-Newton; return the
     ends and the sums of squares (c,), infinite where a start cannot be evaluated.
 
-    A start ends after a step that moves the residuals by a `negligible` share of their sigma, or of
-    themselves, whose end is not evaluated; and at once where its sum of squares is more than
-    `worth` times the lowest one of its `rivals`, the starts with the same number (c,).
+    A start ends after a step that moves the residuals by at most `GOOD_START`, whose end is not
+    evaluated; and at once where its sum of squares is more than `worth` times the lowest one of its
+    `rivals`, the starts with the same number (c,).
     """
     x = np.array(x)
     residual, jacobian = map(np.array, linearize(x, np.arange(len(x))))
     cost, damping = sum_squares(residual), np.full(len(x), FIRST_DAMPING)
     active = np.flatnonzero(np.isfinite(cost))
-    if rivals is not None and worth < np.inf:
+    if worth < np.inf:
         lowest = np.full(int(rivals.max()) + 1, np.inf)
         np.minimum.at(lowest, rivals, cost)
         active = active[cost[active] <= worth * lowest[rivals[active]]]
@@ -160,7 +155,7 @@ def minimize_from_starts(
         if not active.size:
             break
         step, length = _damp_step(residual[active], jacobian[active], damping[active])
-        goes_on = length > negligible * (1.0 + np.sqrt(cost[active]))
+        goes_on = length > GOOD_START * (1.0 + np.sqrt(cost[active]))
         x[active[~goes_on]] += step[~goes_on]
         active, moved = active[goes_on], x[active[goes_on]] + step[goes_on]
         if not active.size:
