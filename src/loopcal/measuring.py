@@ -40,17 +40,7 @@ from loopcal.io.runs.session_folder import (
 )
 from loopcal.measure.measurements import Measurements
 from loopcal.mechanism.model import Mechanism
-from loopcal.planning.companion import (
-    Companion,
-    CompanionTask,
-    Pace,
-    Verdict,
-    choose_next,
-    examine_row,
-    prepare_task,
-    report_progress,
-    take_rows,
-)
+from loopcal.planning import companion
 from loopcal.planning.constraints import restore_options
 from loopcal.results.tables import (
     Column,
@@ -76,16 +66,20 @@ Row = tuple[str, dict[str, str]]
 """Pose of a row of an export, empty for the suggested one, and its cells."""
 
 
-def make_pace(minutes: float | None, speed: float | None) -> Pace:
+def make_pace(minutes: float | None, speed: float | None) -> companion.Pace:
     """Return how long poses take; `speed` [mm per minute] without `minutes` is a DataError."""
     if speed is not None and minutes is None:
         raise DataError.of("session.speed-alone")
-    return Pace(minutes) if speed is None else Pace(minutes, 1e-3 * speed)
+    return companion.Pace(minutes) if speed is None else companion.Pace(minutes, 1e-3 * speed)
 
 
 def prepare_session(
-    sheet: Path, robot: Mechanism, goal: tuple[float, str] | None, pace: Pace, check_every: int
-) -> tuple[CompanionTask, Sheet, KindRows]:
+    sheet: Path,
+    robot: Mechanism,
+    goal: tuple[float, str] | None,
+    pace: companion.Pace,
+    check_every: int,
+) -> tuple[companion.CompanionTask, Sheet, KindRows]:
     """Return the task of measuring a sheet, its table, and its kind.
 
     goal : error over the workspace [SI] and its quantity; None takes that of the plan.
@@ -96,7 +90,7 @@ def prepare_session(
     if has_empty_readings(sheet, robot):
         raise FileError("this sheet asks for readings. Fill in the file itself", sheet)
     asked = {} if goal is None else dict(zip(("goal", "target"), goal, strict=True))
-    task = prepare_task(
+    task = companion.prepare_task(
         load_measurements(sheet, robot),
         robot,
         load_instrument_to_plan(sheet, robot),
@@ -113,12 +107,12 @@ class MeasuringSession:
     paragraphs, tables and findings. known : cells of earlier rows that the export has not repeated.
     """
 
-    task: CompanionTask
+    task: companion.CompanionTask
     journal: Journal
     say: Callable[..., None]
     export: GrowingExport | None = None
     gcode: bool = False
-    state: Companion = field(init=False)
+    state: companion.Companion = field(init=False)
     skipped: list[int] = field(default_factory=list)
     chosen: int | None = None
     pose: int | None = None
@@ -139,8 +133,8 @@ class MeasuringSession:
 
     def choose_pose(self) -> None:
         """Choose the pose to measure next, and say how far the work is."""
-        following = choose_next(self.state, self.skipped, self.chosen)
-        self.progress, self.pose = report_progress(self.state, following), following.pose
+        following = companion.choose_next(self.state, self.skipped, self.chosen)
+        self.progress, self.pose = companion.report_progress(self.state, following), following.pose
         self.say(*self.progress)
 
     def take(self, given: str | Row) -> bool:
@@ -208,13 +202,13 @@ class MeasuringSession:
             self.say(str(error))
             return False
         place = self.task.labels.index(journal.visits[-1].pose)
-        verdict = examine_row(self.state, measured, place)
+        verdict = companion.examine_row(self.state, measured, place)
         self._show_verdict(verdict, measured)
         for visit, now in zip(journal.visits, verdict.is_used, strict=True):
             if visit.is_used != now:
                 journal.decide(USED if now else LEFT_OUT, visit.number)
         poses = (*self.state.poses, place)
-        self.state = take_rows(self.task, measured, poses, verdict.is_used, self.state)
+        self.state = companion.take_rows(self.task, measured, poses, verdict.is_used, self.state)
         self._write()
         self.chosen = None
         return True
@@ -245,12 +239,12 @@ class MeasuringSession:
         self._write()
         return True
 
-    def _restore(self, visits: Sequence[Visit]) -> Companion:
+    def _restore(self, visits: Sequence[Visit]) -> companion.Companion:
         """Return the state of rows on the disk."""
         poses = [self.task.labels.index(visit.pose) for visit in visits]
         used = np.array([bool(visit.is_used) for visit in visits], dtype=bool)
         measured = read_visits(self.task.robot, self.journal.sheet, visits) if visits else None
-        return take_rows(self.task, measured, poses, used)
+        return companion.take_rows(self.task, measured, poses, used)
 
     def _write(self) -> None:
         write_measurements(self.journal.path.parent, self.journal.sheet, self.journal.visits)
@@ -275,7 +269,7 @@ class MeasuringSession:
         units = self.journal.sheet.units
         return tuple(f"{n} [{units[n]}]" if units[n] else n for n in self.journal.columns)
 
-    def _show_verdict(self, verdict: Verdict, measured: Measurements) -> None:
+    def _show_verdict(self, verdict: companion.Verdict, measured: Measurements) -> None:
         """Show measured and expected values of the last row, and what it says."""
         (observed,) = measured.observations
         kind, found, units = observed.kind, verdict.prediction, self.journal.sheet.units

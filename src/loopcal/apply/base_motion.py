@@ -18,16 +18,10 @@ from typing import Any
 
 import numpy as np
 
+from loopcal import geometry
 from loopcal.diagnose.gauge_freedoms import observe_motions, probe_readings
 from loopcal.errors import DataError
 from loopcal.findings import Finding, Quantity, report_finding
-from loopcal.geometry import (
-    differentiate_by_frames,
-    exp_so3,
-    log_so3,
-    make_pose,
-    solve_least_squares,
-)
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.solutions import forward
 from loopcal.typing import BoolArray, FloatArray
@@ -101,7 +95,7 @@ def find_base_motion(
         return None, None
     keeps, kept = "", None
     for word, share in (("both", 1.0), ("turn", 0.0)):
-        before, after = (make_pose(F[:3, :3], share * F[:3, 3]) for F in (M, P))
+        before, after = (geometry.make_pose(F[:3, :3], share * F[:3, 3]) for F in (M, P))
         wanted, trial = _place(before @ T @ after, arms), robot
         for _ in range(STEPS):
             reached, twist = observe_motions(trial, readings)
@@ -116,7 +110,7 @@ def find_base_motion(
             break
     sizes: dict[str, Any] = {"keeps": keeps, "frames": [*compress(FRAMES, allowed[[3, 9]])]}
     for frame, F in zip(FRAMES, (M, P), strict=True):
-        angle, length = (float(np.linalg.norm(v)) for v in (log_so3(F[:3, :3]), F[:3, 3]))
+        angle, length = (float(np.linalg.norm(v)) for v in (geometry.log_so3(F[:3, :3]), F[:3, 3]))
         angle *= angle > ROUNDING
         is_moved = angle * robot.size + length > ROUNDING * robot.size
         sizes[f"{frame}_turn"] = Quantity(math.degrees(angle), "deg") if is_moved else 0
@@ -145,15 +139,15 @@ def _fit_motions(
     M, P = np.eye(4), np.eye(4)
     for _ in range(STEPS):
         moved, step = M @ T @ P, np.zeros(12)
-        J = _list_rows(moved, differentiate_by_frames(moved)[..., allowed], arms)
+        J = _list_rows(moved, geometry.differentiate_by_frames(moved)[..., allowed], arms)
         left = (_place(reference, arms) - _place(moved, arms)) * level
         step[allowed] = _solve(J * np.tile(level, len(left))[:, None], left.ravel())
-        M = make_pose(exp_so3(step[:3]), step[3:6]) @ M
-        P = P @ make_pose(exp_so3(step[6:9]), step[9:])
+        M = geometry.make_pose(geometry.exp_so3(step[:3]), step[3:6]) @ M
+        P = P @ geometry.make_pose(geometry.exp_so3(step[6:9]), step[9:])
     return M, P
 
 
 def _solve(J: FloatArray, left: FloatArray) -> FloatArray:
     """Return the shortest step (k,), in units of its effects, that removes what is left (m,)."""
     scale = 1.0 / np.maximum(np.linalg.norm(J, axis=0), 1e-12)
-    return scale * solve_least_squares(J * scale, left)
+    return scale * geometry.solve_least_squares(J * scale, left)

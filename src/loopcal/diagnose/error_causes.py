@@ -67,16 +67,8 @@ from loopcal.measure.observations import Observations
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.sensitivity import differentiate_pose
 from loopcal.mechanism.solutions import forward
+from loopcal.numerics import statistics
 from loopcal.numerics.split_columns import SplitColumns, span_columns
-from loopcal.numerics.statistics import (
-    UNSEEN,
-    Remainder,
-    choose_evenly,
-    compute_any_probability,
-    compute_f_tail,
-    estimate_variance_component,
-    find_distinct,
-)
 from loopcal.typing import FloatArray, IntArray
 from loopcal.units import Dimension
 
@@ -102,7 +94,7 @@ def list_picture_effects(linear: FitLinearization, rows: ResidualRows) -> list[E
     seen = np.unique(pose[np.any(list(slopes.values()), axis=(0, 2))])
     of_pose, effects = (*[SIZES[0]] * 3, *[SIZES[1]] * 3), list[Effect]()
     for board, columns in slopes.items():
-        for k in seen[choose_evenly(len(seen), STEPS)][1:]:
+        for k in seen[statistics.choose_evenly(len(seen), STEPS)][1:]:
             later = (pose >= k)[:, None] * columns[:, :6]
             effects.append(Effect(MOVED, f"{board}, {labels[k]}", later, of_pose))
     every = np.sum(list(slopes.values()), axis=0)
@@ -369,7 +361,7 @@ def list_drive_effects(linear: FitLinearization, rows: ResidualRows) -> list[Eff
         own = rows.kind == number
         values[own] = Z[rows.row[own], rows.column[own]]
     values *= list_units(linear)
-    chosen = find_distinct(places)
+    chosen = statistics.find_distinct(places)
     of_poses = (places[:, None] == chosen)[:, :, None] * values[:, None, :]
     times = [o.context.get("time") for o in linear.data.observations if len(o)]
     is_alike = len(times) == 1 and len(linear.data.observations[0]) == len(S)
@@ -457,7 +449,7 @@ def explain_residuals(linear: FitLinearization, *, is_doubted: bool = False) -> 
 
 
 def compare_causes(
-    remainder: Remainder, effects: Sequence[Effect], pose: IntArray, known: float,
+    remainder: statistics.Remainder, effects: Sequence[Effect], pose: IntArray, known: float,
     *, is_doubted: bool = False,
 ) -> tuple[Cause, ...]:  # fmt: skip
     """Return the causes among effects and wrong poses; `pose` (R,) of each row. `known` degrees of
@@ -502,7 +494,7 @@ def compare_causes(
             continue
         effect = listed.pop(best - 3)
         spectrum, size = spectra[best - 3], sizes[best - 3]
-        p_value = compute_any_probability(spectrum.compute_tail(known), len(effects))
+        p_value = statistics.compute_any_probability(spectrum.compute_tail(known), len(effects))
         causes.append(Cause(first, effect.name, *stated, effect, size, p_value))
         if first == ZOOMED:  # it has pulled the fit, too
             break
@@ -510,15 +502,15 @@ def compare_causes(
     return tuple(causes)
 
 
-def _estimate_larger_noise(remainder: Remainder, known: float) -> float:
+def _estimate_larger_noise(remainder: statistics.Remainder, known: float) -> float:
     """Return the evidence of a noise of unknown size beside the stated one."""
     square = float(remainder.residual @ remainder.weigh(remainder.residual))
     count = max(round(remainder.degrees), 1)
     y = np.full(count, np.sqrt(square / count))
-    return estimate_variance_component(np.ones(count), y, known).evidence
+    return statistics.estimate_variance_component(np.ones(count), y, known).evidence
 
 
-def measure_wrong_poses(remainder: Remainder, pose: IntArray, known: float) -> float:
+def measure_wrong_poses(remainder: statistics.Remainder, pose: IntArray, known: float) -> float:
     """Return the evidence of few wrong poses; the worst one is excluded, and so on."""
     order = np.argsort(pose, kind="stable")
     names, count = np.unique(pose, return_counts=True)
@@ -534,7 +526,7 @@ def measure_wrong_poses(remainder: Remainder, pose: IntArray, known: float) -> f
             is_row[:, None] * np.eye(member.shape[1]) - P @ P.swapaxes(1, 2)
         )
         y = (own[:, None] @ vectors)[:, 0]
-        is_open = w > UNSEEN
+        is_open = w > statistics.UNSEEN
         distance = (np.where(is_open, y, 0.0) ** 2 / np.where(is_open, w, 1.0)).sum(axis=1)
         degrees = is_open.sum(axis=1)
         left = remainder.degrees + known - degrees
@@ -544,7 +536,9 @@ def measure_wrong_poses(remainder: Remainder, pose: IntArray, known: float) -> f
         spread = np.ones(len(left))
         if not np.isinf(known):
             np.divide(square + known - distance, left, out=spread, where=is_tested)
-        p_value = compute_f_tail(degrees, left, distance / np.maximum(degrees, 1) / spread)
+        p_value = statistics.compute_f_tail(
+            degrees, left, distance / np.maximum(degrees, 1) / spread
+        )
         worst = int(np.argmin(np.where(is_tested, p_value, 2.0)))
         columns = np.zeros((len(pose), int(count[worst])))
         columns[member[worst, : count[worst]], np.arange(count[worst])] = 1.0

@@ -60,17 +60,8 @@ from loopcal.estimate.smooth_errors import (
 from loopcal.findings import Finding, report_finding
 from loopcal.measure.measurements import Measurements
 from loopcal.mechanism.solutions import forward
+from loopcal.numerics import statistics
 from loopcal.numerics.split_columns import SplitColumns
-from loopcal.numerics.statistics import (
-    VarianceComponent,
-    compute_any_probability,
-    compute_chi_square_tail,
-    compute_component_tail,
-    compute_f_tail,
-    compute_single_level,
-    estimate_variance_component,
-    find_distinct,
-)
 from loopcal.results.description import Field, fields
 from loopcal.typing import FloatArray, IntArray
 from loopcal.units import Dimension
@@ -185,7 +176,7 @@ class SlowError(NamedTuple):
     """Independent errors of equal size in some directions."""
 
     directions: FloatArray  # (6, d) unit vectors of rotation and place
-    size: VarianceComponent
+    size: statistics.VarianceComponent
     p_value: float  # without them, in any of the tests that are made
 
 
@@ -235,13 +226,13 @@ def find_slow_errors(
     short = project(SHORT_KERNELS[:1], measured, FINE_CENTERS) if measured.size else []
     known = count_sigma_degrees(fit.residual_test.noise, fit.options.sigma_uncertainty)
     lengths = (*tested, *short)
-    level = compute_single_level(LEVEL, len(lengths)) if named == 1.0 else 1.0
+    level = statistics.compute_single_level(LEVEL, len(lengths)) if named == 1.0 else 1.0
     slow = [detect_slow_errors(rows, groups, known, level) for rows in lengths]
     if not any(slow):
         return find_rough_errors(linear, T)
     found = min((each for each in slow if each), key=lambda each: min(e.p_value for e in each))
     tests = len(lengths) * len(groups)
-    p_values = [min(named, compute_any_probability(e.p_value, tests)) for e in found]
+    p_values = [min(named, statistics.compute_any_probability(e.p_value, tests)) for e in found]
     found = [e._replace(p_value=p) for e, p in zip(found, p_values, strict=True)]
     fine = [*project(KERNELS, measured, FINE_CENTERS), *short]
     fine += project(SHORT_KERNELS[1:], measured, FINE_CENTERS)
@@ -288,9 +279,9 @@ def find_rough_errors(linear: FitLinearization, T: FloatArray) -> SlowErrors | N
     for directions in find_measured_directions(rows):
         u, w = _find_axes(_columns(rows.rows, rows.errors, directions))
         y = (u.T @ rows.residuals) / lack.sigma_scale
-        p_value = float(compute_f_tail(len(y), lack.pure_degrees, float(y @ y) / len(y)))
+        p_value = float(statistics.compute_f_tail(len(y), lack.pure_degrees, float(y @ y) / len(y)))
         if p_value < REPEATS_LEVEL:
-            size = estimate_variance_component(w, y, lack.pure_degrees)
+            size = statistics.estimate_variance_component(w, y, lack.pure_degrees)
             size = size._replace(variance=size.variance * lack.sigma_scale**2)
             rough.append(SlowError(directions, size, p_value))
     return SlowErrors(rows, tuple(rough), is_slow=False) if rough else None
@@ -373,7 +364,7 @@ def find_dense_regions(fit: Identification, data: Measurements) -> IntArray | No
     if not solution.converged.all():
         return None
     regions = own.errors.group_regions(solution.T)
-    return regions if len(find_distinct(regions)) >= FEWEST_REGIONS else None
+    return regions if len(statistics.find_distinct(regions)) >= FEWEST_REGIONS else None
 
 
 def find_measured_directions(rows: SlowErrorRows) -> list[FloatArray]:
@@ -405,7 +396,7 @@ def divide_by_direction(
     kinds = {_is_place(error.directions) for error in found}
     together = [directions for directions in groups if _is_place(directions) in kinds]
     single = [directions[:, [i]] for directions in together for i in range(directions.shape[1])]
-    level = compute_any_probability(DIRECTION_LEVEL, len(single))
+    level = statistics.compute_any_probability(DIRECTION_LEVEL, len(single))
     shown = detect_slow_errors(rows, single, known, level)
     kinds = {_is_place(error.directions) for error in shown}
     rest = [directions for directions in together if _is_place(directions) not in kinds]
@@ -424,12 +415,12 @@ def detect_slow_errors(
     finding any without such errors.
     """
     remaining, found = list(range(len(groups))), []
-    level = compute_single_level(level, len(remaining))
+    level = statistics.compute_single_level(level, len(remaining))
     residuals, whitened = rows.residuals, rows.rows
     while remaining:
         turned = {i: _find_axes(_columns(whitened, rows.errors, groups[i])) for i in remaining}
         tests = {i: (w, u.T @ residuals) for i, (u, w) in turned.items()}
-        p_values = {i: compute_component_tail(*test) for i, test in tests.items()}
+        p_values = {i: statistics.compute_component_tail(*test) for i, test in tests.items()}
         best = min(remaining, key=lambda each: p_values[each])
         if not p_values[best] <= level:
             break
@@ -438,7 +429,7 @@ def detect_slow_errors(
         y = tests[best][1]
         rest = (max(float(residuals @ residuals - y @ y), 0.0), len(residuals) - len(y))
         typical = float(rows.residuals @ rows.residuals) / measure_size(rows, groups[best])
-        size = estimate_variance_component(w, y, known, rest, typical)
+        size = statistics.estimate_variance_component(w, y, known, rest, typical)
         found.append(SlowError(groups[best], size, p_values[best]))
         # u diag(1 / sqrt(1 + ratio w)) u' + (I - u u')
         shrink = 1.0 / np.sqrt(1.0 + size.ratio * w) - 1.0
@@ -560,11 +551,11 @@ def check_lack_of_fit(fit: Identification, data: Measurements) -> LackOfFit:
     if lack_degrees < 1.0 or pure <= 0.0:
         return LackOfFit((report_finding(NOT_COMPARABLE, reason="few-equations"),), *known)
     ratio = max(lack, 0.0) / lack_degrees / (pure / degrees)
-    p_value = float(compute_f_tail(lack_degrees, degrees, ratio))
+    p_value = float(statistics.compute_f_tail(lack_degrees, degrees, ratio))
     findings = [report_finding("residuals.explained")]
     if p_value < REPEATS_LEVEL:
         findings = [report_finding("residuals.lack-of-fit", ratio=float(np.sqrt(ratio)))]
-    tail = float(compute_chi_square_tail(degrees, scale**2 * degrees))
+    tail = float(statistics.compute_chi_square_tail(degrees, scale**2 * degrees))
     if tail < SIGNIFICANCE:
         findings.append(report_finding("residuals.repeatability-larger", scale=scale))
     if tail > 1.0 - SIGNIFICANCE:
@@ -582,7 +573,7 @@ def _pure_error(fit: Identification, data: Measurements, member: IntArray) -> tu
             same = np.arange(len(rows.poses))[:, None]
         groups.append(np.unique(same, axis=0, return_inverse=True)[1].ravel())
     total, degrees = 0.0, 0
-    if all(len(find_distinct(of_rows)) == len(of_rows) for of_rows in groups):
+    if all(len(statistics.find_distinct(of_rows)) == len(of_rows) for of_rows in groups):
         return total, degrees
     z = fit.free_parameters.deviation(fit.robot.values[None])
     residuals = problem.residuals(z, problem.solve(z, problem.start(z)))

@@ -45,15 +45,9 @@ from loopcal.estimate.residual_test import (
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
 from loopcal.measure.measurements import Measurements
+from loopcal.numerics import statistics
 from loopcal.numerics.decomposition import Decomposition
 from loopcal.numerics.elimination import spread_columns
-from loopcal.numerics.statistics import (
-    choose_evenly,
-    compute_chi_square_quantile,
-    compute_f_tail,
-    compute_single_level,
-    find_distinct,
-)
 from loopcal.results.description import Field, fields, label_axes
 from loopcal.results.result import TableResult
 from loopcal.typing import BoolArray, FloatArray, IntArray, Progress, report_no_progress
@@ -177,7 +171,7 @@ def iterate_blocks(
         block_of_row = block_of_row[order]
         numbers, first, sizes = np.unique(block_of_row, return_index=True, return_counts=True)
         complete = sizes == total[numbers]
-        for size in find_distinct(sizes[complete]):
+        for size in statistics.find_distinct(sizes[complete]):
             chosen = complete & (sizes == size)
             places = order[first[chosen][:, None] + np.arange(size)]
             own, columns = join_columns(unknowns[places], moved[places])
@@ -259,7 +253,7 @@ class PartialFit(NamedTuple):
     def p_value(self) -> FloatArray:
         """Return (u,) the probability of a larger distance; 1 where there is no test."""
         left = np.inf if self.noise is None else self.noise[1]
-        p_value = compute_f_tail(self.influence.degrees, left, self.ratio)
+        p_value = statistics.compute_f_tail(self.influence.degrees, left, self.ratio)
         return np.where(np.isnan(p_value), 1.0, p_value)
 
     def determines_as_much(self, whole: PartialFit) -> bool:
@@ -302,7 +296,7 @@ def search_blocks(
     whole = first = refit(np.zeros_like(low_weight))
     if low_weight.any() and (without := refit(low_weight)).determines_as_much(whole):
         first = without
-    limit = compute_single_level(level, whole.tested)
+    limit = statistics.compute_single_level(level, whole.tested)
     most, fits = int(MOST_EXCLUDED * whole.tested), [first]
     while len(fits) <= MOST_ROUNDS:
         progress(len(fits) - 1, MOST_ROUNDS, "searching for outliers")
@@ -381,7 +375,9 @@ def find_ambiguous(search: BlockSearch, progress: Progress = report_no_progress)
     suspects = suspects[np.argsort(-end.ratio[suspects], kind="stable")][:MOST_COMPARED]
     for done, i in enumerate(suspects):
         progress(done, len(suspects), "comparing suspected poses with others")
-        far = float(compute_chi_square_quantile(max(int(end.influence.degrees[i]), 1), limit))
+        far = float(
+            statistics.compute_chi_square_quantile(max(int(end.influence.degrees[i]), 1), limit)
+        )
         if not _may_have_rivals(end, i, far):
             continue
         excluded = end.excluded.copy()
@@ -595,7 +591,7 @@ def find_outliers(
     summary = _summarize(fit, len(outliers), suspected, level, shared, is_converged=is_converged)
     # whether the fitted blocks exceed the stated noise beyond doubt
     stated = count_sigma_degrees(noise, fit.options.sigma_uncertainty)
-    tail = compute_f_tail(end.left, stated, end.scale**2)
+    tail = statistics.compute_f_tail(end.left, stated, end.scale**2)
     if noise == "given" and outliers and end.left > 0.0 and tail < SIGNIFICANCE:
         summary = (report_finding("outliers.larger-noise", times=end.scale, **shared), *summary)
     return OutlierCheck(
@@ -611,7 +607,7 @@ def _refit_robustly(
     """
     count = int(member.max()) + 1
     if count > MOST_ROBUST:
-        data = data.take(np.isin(member, choose_evenly(count, MOST_ROBUST)))
+        data = data.take(np.isin(member, statistics.choose_evenly(count, MOST_ROBUST)))
     options = replace(fit.options, loss=Tukey(), noise="estimated")
     try:
         robust = identify(fit.initial, data, options=options, progress=progress)

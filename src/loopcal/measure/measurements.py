@@ -12,13 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from loopcal.errors import DataError
-from loopcal.measure.array_checks import (
-    check_array,
-    check_seed,
-    check_type,
-    refuse_first,
-    set_fields,
-)
+from loopcal.measure import array_checks
 from loopcal.measure.kinds.kind import Kind
 from loopcal.measure.nuisance import NuisanceParameters, StatedValue, collect_nuisance_parameters
 from loopcal.measure.observations import Observations, check_poses
@@ -126,9 +120,9 @@ class Measurements(TableResult):
     LABELS: ClassVar[Mapping[str, Any]] = label_axes(measured_pose="labels")
 
     def __post_init__(self) -> None:
-        readings = check_array(self.readings, "readings", (None, None), allow_nan=True)
+        readings = array_checks.check_array(self.readings, "readings", (None, None), allow_nan=True)
         if self.reading_sigma is None:
-            refuse_first(
+            array_checks.refuse_first(
                 np.isnan(readings),
                 lambda i, j: (
                     f"readings: row {i + 1}, column {j + 1} is nan. Give a finite number, "
@@ -149,11 +143,11 @@ class Measurements(TableResult):
         if len(labels) != n:
             raise DataError(f"{len(labels)} labels for {n} poses. Give one for each")
         for rows in self.observations:
-            check_type(
+            array_checks.check_type(
                 rows, Observations, "observations", "such as loopcal.Observations.from_sigma(...)"
             )
             check_poses(rows.rows, rows.kind, n)
-        set_fields(
+        array_checks.set_fields(
             self,
             readings=readings,
             block=block,
@@ -165,7 +159,7 @@ class Measurements(TableResult):
         _check_bodies(self.observations, self.base_observations)
         if self.reading_sigma is not None:
             sigma = check_reading_sigma(self.reading_sigma, readings, labels)
-            set_fields(self, reading_sigma=sigma)
+            array_checks.set_fields(self, reading_sigma=sigma)
 
     def __repr__(self) -> str:
         n, a = self.readings.shape
@@ -318,7 +312,7 @@ class Measurements(TableResult):
         seed : the same seed gives the same sets. regions : (n,) numbers of sets of poses that are
             not split either.
         """
-        check_seed(seed)
+        array_checks.check_seed(seed)
         if not 0.0 < hold_out < 1.0:
             raise DataError(
                 f"cannot hold out a share of {hold_out}. Give the share of the poses outside the "
@@ -337,7 +331,7 @@ class Measurements(TableResult):
         ------
         DataError : the number of weights is not that of the poses, or one is negative.
         """
-        given = check_array(weight, "the weight of the poses", (self.n_poses,))
+        given = array_checks.check_array(weight, "the weight of the poses", (self.n_poses,))
         observations = tuple(
             rows.with_weights(given[rows.rows].reshape(len(rows), -1).prod(axis=1))
             for rows in self.observations

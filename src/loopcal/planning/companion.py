@@ -48,15 +48,9 @@ from loopcal.numerics.statistics import (
     compute_f_tail,
     compute_single_level,
 )
+from loopcal.planning import design_space
 from loopcal.planning.candidates import Candidates
 from loopcal.planning.constraints import PlanOptions, build_checker
-from loopcal.planning.design_space import (
-    Scoring,
-    compute_swap_terms,
-    factor_square,
-    is_determined,
-    score_additions,
-)
 from loopcal.planning.exchange import RIDGE
 from loopcal.planning.path import check_paths, locate_home, measure_distance
 from loopcal.planning.problem import DIMENSIONS, ExpectedErrors, PlanningProblem, prepare_problem
@@ -117,7 +111,7 @@ class CompanionTask:
         return self.problem.robot
 
     @cached_property
-    def scoring(self) -> Scoring:
+    def scoring(self) -> design_space.Scoring:
         """How poses are compared: by the mean variance of the target over the workspace."""
         return self.problem.pose_design(name="I").build_scoring(int((~self.is_held_out).sum()))
 
@@ -179,7 +173,7 @@ def solve_rows(rows: FloatArray, unit: FloatArray) -> PartialSolution:
     k = rows.shape[1] - 1
     length = np.append(np.linalg.norm(rows[:, :k], axis=0), 1.0)
     length[length == 0.0] = 1.0
-    R = factor_square(rows / length)
+    R = design_space.factor_square(rows / length)
     u, s, vt = np.linalg.svd(R[:k, :k])
     far = np.linalg.norm(vt / (length[:k] * unit), axis=1) > FAR * s
     known, along = are_nonzero(s) & ~far, u.T @ R[:k, k]
@@ -683,16 +677,16 @@ def order_by_gain(
     R, is_regular = task.scoring.factor(rows), False
     while count < most and (left or usable):
         among, at = left or usable, R
-        is_regular = is_regular or is_determined(R)
+        is_regular = is_regular or design_space.is_determined(R)
         if not is_regular:
-            at = factor_square(np.concatenate([R, RIDGE * np.eye(len(R))]))
-        terms = compute_swap_terms(task.scoring, at, scaled[among])
-        gain = score_additions(terms) / (1.0 if count else minutes[among])
+            at = design_space.factor_square(np.concatenate([R, RIDGE * np.eye(len(R))]))
+        terms = design_space.compute_swap_terms(task.scoring, at, scaled[among])
+        gain = design_space.score_additions(terms) / (1.0 if count else minutes[among])
         # of poses that gain equally but for rounding, as on a symmetric machine, the first one
         best = among[int(np.argmax(gain >= gain.max() - TIE))]
         yield best
         count += 1
-        R = factor_square(np.concatenate([R, scaled[best]]))
+        R = design_space.factor_square(np.concatenate([R, scaled[best]]))
         if best in left:
             left.remove(best)
 

@@ -28,16 +28,7 @@ import numpy as np
 
 from loopcal.errors import FileError, UnitError, suggest_names
 from loopcal.findings import Finding, report_finding
-from loopcal.io.core.limits import (
-    LINE_LENGTH,
-    LONGEST_COMPOSED,
-    LONGEST_NAME,
-    TABLE_COLUMNS,
-    TABLE_LINES,
-    TABLE_ROWS,
-    TABLE_SIZE,
-    find_fault,
-)
+from loopcal.io.core import limits
 from loopcal.io.core.text_file import as_path, read_text
 from loopcal.io.core.yaml_file import YamlFile, parse_yaml, read_yaml
 from loopcal.plain_text import quote
@@ -291,8 +282,8 @@ def read_table(path: str | Path) -> Table:
 def read_template(path: str | Path) -> Table:
     """Read a CSV table that may have no rows; raise as `read_table`."""
     path = as_path(path, WHAT)
-    text = read_text(path, WHAT, CONVERT_HINT, TABLE_SIZE)
-    TABLE_LINES.check(text.count("\n"), WHAT, path)
+    text = read_text(path, WHAT, CONVERT_HINT, limits.TABLE_SIZE)
+    limits.TABLE_LINES.check(text.count("\n"), WHAT, path)
     settings, first = _read_settings(path, text)
     numbers, longest, header = array("q"), (0, 0), ""
     for at, lines in _iterate_rows(text, first):
@@ -304,9 +295,9 @@ def read_template(path: str | Path) -> Table:
     if not numbers:
         raise FileError("this file has no header; its first line names columns and units", path)
     header_line = numbers.pop(0)
-    TABLE_ROWS.check(len(numbers), WHAT, path)
-    LINE_LENGTH.check(longest[0], WHAT, path, longest[1])
-    TABLE_COLUMNS.check(header.count(",") + 1, WHAT, path, header_line)
+    limits.TABLE_ROWS.check(len(numbers), WHAT, path)
+    limits.LINE_LENGTH.check(longest[0], WHAT, path, longest[1])
+    limits.TABLE_COLUMNS.check(header.count(",") + 1, WHAT, path, header_line)
     if "," not in header and (";" in header or "\t" in header):
         separator = "semicolons" if ";" in header else "tabs"
         sentence = f"{separator} separate the columns. Use commas, and decimal points"
@@ -324,9 +315,9 @@ def read_template(path: str | Path) -> Table:
     columns = {name: Cells(block[i] for block in blocks) for i, name in enumerate(units)}
     table = Table(path, settings, header_line, units, columns, numbers)
     for column in (name for name in NAME_COLUMNS if name in units):
-        longest = LONGEST_COMPOSED if column == "pose" else LONGEST_NAME
+        longest = limits.LONGEST_COMPOSED if column == "pose" else limits.LONGEST_NAME
         for cell in dict.fromkeys(table.text(column)):
-            if (fault := find_fault(cell, longest)) is not None:
+            if (fault := limits.find_fault(cell, longest)) is not None:
                 raise table.row_error(tuple(table.text(column)).index(cell), fault)
     return table
 
@@ -452,7 +443,7 @@ def _parse_header(path: Path, line: int, text: str) -> dict[str, str | None]:
     for i, cell in enumerate(cells):
         match = _HEADER.match(cell)
         name = cell if match is None else match["name"]
-        fault: str | Finding | None = find_fault(name, LONGEST_COMPOSED)
+        fault: str | Finding | None = limits.find_fault(name, limits.LONGEST_COMPOSED)
         if match is None:
             fault = f"header of column {i + 1} is {quote(cell)}. Write name and unit, as 'x [mm]'"
         elif fault is None and name in units:

@@ -21,13 +21,7 @@ import numpy as np
 
 from loopcal.errors import suggest_names
 from loopcal.findings import Finding, report_finding
-from loopcal.io.core.csv_table import (
-    NAME_COLUMNS,
-    Table,
-    format_exact,
-    format_scaled,
-    suggest_header,
-)
+from loopcal.io.core import csv_table
 from loopcal.measure.kinds.kind import Kind
 from loopcal.mechanism.assembly import FORCES
 from loopcal.mechanism.model import Mechanism
@@ -55,7 +49,7 @@ class Column(ABC):
         return self.name
 
     @abstractmethod
-    def parse(self, table: Table) -> Any:
+    def parse(self, table: csv_table.Table) -> Any:
         """Return the values of all rows (n,) of a table that has this column; raise FileError."""
 
     @abstractmethod
@@ -69,7 +63,7 @@ class TextColumn(Column):
 
     choices: tuple[str, ...] = ()
 
-    def parse(self, table: Table) -> tuple[str, ...]:
+    def parse(self, table: csv_table.Table) -> tuple[str, ...]:
         """Return the cells in Unicode normal form C."""
         cells = table.text(self.name)
         for row, cell in enumerate(cells):
@@ -99,7 +93,7 @@ class NumberColumn(Column):
         """Name, and unit where there is one."""
         return f"{self.name} [{'*'.join(self.symbols)}]" if self.symbols else self.name
 
-    def parse(self, table: Table) -> FloatArray:
+    def parse(self, table: csv_table.Table) -> FloatArray:
         """Return the values [SI], NaN where a cell is empty, which that of a covariance is not."""
         dimensions, stated = [find_unit(s).dimension for s in self.symbols], table.units[self.name]
         if not dimensions and stated is not None:
@@ -124,7 +118,7 @@ class NumberColumn(Column):
         if not self.symbols:
             return f"{number:g}"
         factor = math.prod(find_unit(symbol).factor_to_si for symbol in self.symbols)
-        write = format_exact if len(self.symbols) == 1 else format_scaled
+        write = csv_table.format_exact if len(self.symbols) == 1 else csv_table.format_scaled
         return write(number, factor)
 
 
@@ -146,7 +140,7 @@ class ContextColumn(Column):
         """Name and unit."""
         return f"{self.name} [{SI_SYMBOLS[self.dimension]}]"
 
-    def parse(self, table: Table) -> FloatArray:
+    def parse(self, table: csv_table.Table) -> FloatArray:
         """Return the values [s] or [degC], NaN where a cell is empty."""
         cells = table.text(self.name)
         if self.name == TIME and table.units[self.name] is None:
@@ -160,7 +154,7 @@ class ContextColumn(Column):
         return values
 
     @staticmethod
-    def _parse_date(table: Table, row: int, cell: str) -> float:
+    def _parse_date(table: csv_table.Table, row: int, cell: str) -> float:
         """Return seconds since 1970-01-01 UTC of a date and time; NaN for an empty cell."""
         try:
             moment = datetime.fromisoformat(cell) if cell else None
@@ -174,7 +168,7 @@ class ContextColumn(Column):
 
     def format(self, value: Any) -> str:
         """Return the number [s] or [degC]; nothing for NaN."""
-        return "" if math.isnan(float(value)) else format_exact(float(value), 1.0)
+        return "" if math.isnan(float(value)) else csv_table.format_exact(float(value), 1.0)
 
 
 @dataclass(frozen=True)
@@ -367,7 +361,7 @@ RULES: tuple[ColumnRule, ...] = (
     ),
 )
 
-ROLES = (*NAME_COLUMNS, TIME, TEMPERATURE)  # columns with the same meaning in every file
+ROLES = (*csv_table.NAME_COLUMNS, TIME, TEMPERATURE)  # columns with the same meaning in every file
 
 
 def list_columns(robot: Mechanism, kinds: Sequence[Kind]) -> dict[str, Column]:
@@ -386,18 +380,20 @@ def is_context(name: str) -> bool:
     return name in (TIME, TEMPERATURE) or place not in ("", name)
 
 
-def read_context(table: Table) -> dict[str, FloatArray]:
+def read_context(table: csv_table.Table) -> dict[str, FloatArray]:
     """Return name -> (rows,) of the times [s] and temperatures [degC] of a table."""
     return {name: ContextColumn(name).parse(table) for name in table.names if is_context(name)}
 
 
-def refuse_unknown_columns(table: Table, robot: Mechanism, kinds: Sequence[Kind]) -> None:
+def refuse_unknown_columns(table: csv_table.Table, robot: Mechanism, kinds: Sequence[Kind]) -> None:
     """Raise FileError for the first column that has no meaning in this file."""
     known = list_columns(robot, kinds)
     for name in table.names:
         if name in known or find_open_column(name) is not None:
             continue
-        hint = suggest_header(name, table.units[name], known) or suggest_names(name, known)
+        hint = csv_table.suggest_header(name, table.units[name], known) or suggest_names(
+            name, known
+        )
         families = sorted({re.sub(r"\..*", ".*", known_name) for known_name in known})
         hint = hint or f". Allowed: {', '.join(families)}"
         act = f"correct it, or call it '{NOTE} {name}' to ignore it"

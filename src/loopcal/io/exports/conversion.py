@@ -34,6 +34,7 @@ from loopcal import geometry
 from loopcal.errors import FileError, suggest_names
 from loopcal.findings import Finding, report_finding
 from loopcal.findings.wording import name_count
+from loopcal.io.core import limits
 from loopcal.io.core.csv_table import (
     NAME_COLUMNS,
     Cells,
@@ -44,15 +45,6 @@ from loopcal.io.core.csv_table import (
     read_table,
     refuse_settings_beside,
     require_columns,
-)
-from loopcal.io.core.limits import (
-    LINE_LENGTH,
-    PATTERN_SECONDS,
-    TABLE_ROWS,
-    TABLE_SIZE,
-    find_fault,
-    format_comment,
-    make_name,
 )
 from loopcal.io.core.text_file import as_path, read_bytes, read_text, write_text
 from loopcal.io.core.yaml_file import format_flow
@@ -111,9 +103,9 @@ def read_lines(
     lines: list[Line] = []
     header, nearest, skipped = None, None, 0
     text = _decode(path, profile, content).replace("\r\n", "\n").replace("\r", "\n")
-    TABLE_ROWS.check(text.count("\n"), "export", path)
+    limits.TABLE_ROWS.check(text.count("\n"), "export", path)
     for number, line in enumerate(text.split("\n"), 1):
-        LINE_LENGTH.check(len(line), "export", path, number)
+        limits.LINE_LENGTH.check(len(line), "export", path, number)
         is_comment = record.comment is not None and line.lstrip().startswith(record.comment)
         is_ignored = ignored is not None and clock.match(ignored.search, line, ("ignore",))
         if number <= record.skip or not line.strip() or is_comment or is_ignored:
@@ -217,7 +209,7 @@ def _count(cells: Sequence[str], wanted: int) -> int:
 
 def _decode(path: Path, profile: Profile, content: bytes | None) -> str:
     """Return the text of the export."""
-    raw = read_bytes(path, "export", TABLE_SIZE) if content is None else content
+    raw = read_bytes(path, "export", limits.TABLE_SIZE) if content is None else content
     act = "Give its 'encoding' in the profile"
     try:
         text = raw.decode(profile.encoding)
@@ -382,7 +374,7 @@ class Conversion:
 def convert_export(
     path: str | Path,
     profile: Profile,
-    pattern_seconds: float = PATTERN_SECONDS.most,
+    pattern_seconds: float = limits.PATTERN_SECONDS.most,
     content: bytes | None = None,
 ) -> Conversion:
     """Convert an export; the patterns of the profile may take `pattern_seconds`, else FileError.
@@ -418,11 +410,11 @@ def convert_export(
         raise FileError(f"{sentence}; reason for the first one: {reason}", path, number)
     findings += _report_unused(fitting[0][0], profile)
     settings = {"format": FORMAT, **profile.record.settings}
-    remark = format_comment(f"converted from {path.name} by {profile.file.path.name}")
+    remark = limits.format_comment(f"converted from {path.name} by {profile.file.path.name}")
     lines = [f"## {remark}"]
     if misfits:
         lines.append(f"## lines that do not fit: {', '.join(str(number) for number, _ in misfits)}")
-    lines += [f"## {format_comment(str(finding))}" for finding in findings]
+    lines += [f"## {limits.format_comment(str(finding))}" for finding in findings]
     lines += [f"# {key}: {format_flow(value)}" for key, value in settings.items()]
     columns = list_headers(profile)
     # a target without a line has no covariance
@@ -458,12 +450,12 @@ def _parse_row(
             groups = match.groupdict("")
             row |= {k: groups[k].strip() for k in ("pose", "target") if k in groups}
         else:
-            row[name] = make_name(text) if name.startswith(NOTE) else text
+            row[name] = limits.make_name(text) if name.startswith(NOTE) else text
             row[name] = _parse_time(text, source) if name == TIME else row[name]
     if (use := row.get(USE_COLUMN.name, "")) not in ("", *USE_COLUMN.choices):
         raise Misfit(f"the use {quote(use)} is not {' or '.join(USE_COLUMN.choices)}")
     for name in NAME_COLUMNS:
-        if (fault := find_fault(row.get(name, ""))) is not None:
+        if (fault := limits.find_fault(row.get(name, ""))) is not None:
             raise Misfit(str(fault))
     if "pose" in profile.columns and (not row["pose"] or LINK in row["pose"]):
         raise Misfit(

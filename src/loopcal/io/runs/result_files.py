@@ -15,13 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from loopcal.errors import suggest_names
-from loopcal.io.core.csv_table import (
-    format_columns,
-    format_exact,
-    format_row,
-    format_scaled,
-    read_table,
-)
+from loopcal.io.core import csv_table
 from loopcal.io.core.outputs import FolderKind
 from loopcal.io.data.columns import COMMANDED, NOTE
 from loopcal.io.data.measurement_file import load_pose_names, load_poses
@@ -47,7 +41,7 @@ def load_targets(path: str | Path, robot: Mechanism) -> tuple[FloatArray, tuple[
 
     FileError : a value that does not fit, at its line.
     """
-    table = read_table(path)
+    table = csv_table.read_table(path)
     coordinates, known = load_poses(table, robot), ("pose", *robot.controlled)
     for name in table.names:
         if name not in known and not name.startswith(NOTE):
@@ -68,7 +62,7 @@ def format_compensation(result: Compensation) -> str:
     for (name, dimension), column in zip(dimensions.items(), values.T.tolist(), strict=True):
         unit, cells = robot.get_unit(dimension), zip(column, result.usable, strict=True)
         columns[f"{name} [{unit.symbol}]"] = [
-            format_exact(value, unit.factor_to_si) if is_usable else ""
+            csv_table.format_exact(value, unit.factor_to_si) if is_usable else ""
             for value, is_usable in cells
         ]
     errors = {"before": result.before, "remaining": result.remaining}
@@ -79,7 +73,7 @@ def format_compensation(result: Compensation) -> str:
             unit = robot.get_unit(get_dimension(name))
             cells = [_format_error(value / unit.factor_to_si) for value in column]
             columns[f"{NOTE} {title} {name} [{unit.symbol}]"] = cells
-    return format_columns(columns | {f"{NOTE} status": map(str, result.findings)})
+    return csv_table.format_columns(columns | {f"{NOTE} status": map(str, result.findings)})
 
 
 def _format_error(value: float) -> str:
@@ -92,7 +86,7 @@ def _format_error(value: float) -> str:
 def format_comparison(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """Return the table of a comparison as CSV: titles of columns, and their cells as text."""
     lines = [titles, *rows]
-    return "".join(format_row(map(escape_formula, line)) + "\n" for line in lines)
+    return "".join(csv_table.format_row(map(escape_formula, line)) + "\n" for line in lines)
 
 
 CURVES_FORMAT, POINTS, PICTURE = 1, "curves.csv", "curves.png"
@@ -120,5 +114,5 @@ def format_draws(
     if weight is not None:
         columns["weight"] = map(repr, weight.tolist())
     for name, unit, factor, column in zip(names, units, factors, draws.T.tolist(), strict=True):
-        columns[f"{name} [{unit}]"] = [format_scaled(value, factor) for value in column]
-    return format_columns(columns)
+        columns[f"{name} [{unit}]"] = [csv_table.format_scaled(value, factor) for value in column]
+    return csv_table.format_columns(columns)

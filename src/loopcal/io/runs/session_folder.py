@@ -20,6 +20,7 @@ from pathlib import Path
 
 from loopcal.errors import FileError
 from loopcal.findings import report_finding
+from loopcal.io.core import text_file
 from loopcal.io.core.csv_table import (
     Table,
     format_exact,
@@ -28,14 +29,6 @@ from loopcal.io.core.csv_table import (
     parse_exact,
     parse_finite,
     read_template,
-)
-from loopcal.io.core.text_file import (
-    lock,
-    report_write_errors,
-    resolve_links,
-    sha256,
-    sync_folder,
-    write_text,
 )
 from loopcal.io.data.columns import TIME
 from loopcal.io.exports.conversion import Row, format_rows, read_rows
@@ -109,7 +102,7 @@ class Journal:
 def write_line(descriptor: int, path: Path, line: str) -> None:
     """Append a line to a file and write it to the disk, whole or not at all."""
     content, size = (line + "\n").encode(), os.fstat(descriptor).st_size
-    with report_write_errors(path):
+    with text_file.report_write_errors(path):
         try:
             if os.write(descriptor, content) < len(content):
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
@@ -126,14 +119,14 @@ def open_session(folder: Path, sheet: Table, columns: Sequence[str]) -> Iterator
     FileError : the folder cannot be written, is used by another command, has other content, or
     belongs to another sheet.
     """
-    path, digest = resolve_links(folder) / ROWS, sha256(sheet.path)
+    path, digest = text_file.resolve_links(folder) / ROWS, text_file.sha256(sheet.path)
     if folder.exists() and not path.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise FileError.of("session.other-content", folder)
-    with report_write_errors(path):
+    with text_file.report_write_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o666)
     try:
-        if lock(descriptor) is False:
+        if text_file.lock(descriptor) is False:
             raise FileError.of("session.in-use", folder)
         header = {"event": None, "row": None, "pose": None, TIME: None}
         header |= {name: sheet.units[name] for name in columns}
@@ -142,7 +135,7 @@ def open_session(folder: Path, sheet: Table, columns: Sequence[str]) -> Iterator
         if begin.startswith(content):  # nothing yet, or a header that was not written to its end
             os.ftruncate(descriptor, 0)
             write_line(descriptor, path, "\n".join(lines))
-            sync_folder(path.parent)
+            text_file.sync_folder(path.parent)
         elif not content.startswith(REMARK.encode()):
             raise FileError.of("session.other-content", folder)
         elif not content.startswith(begin):
@@ -208,7 +201,7 @@ def write_measurements(folder: Path, sheet: Table, visits: Sequence[Visit]) -> N
     """Write the used rows as the input of a calibration."""
     used = [visit for visit in visits if visit.is_used]
     if used:
-        write_text(folder / DATA, format_rows(sheet, *_list_rows(sheet, used)))
+        text_file.write_text(folder / DATA, format_rows(sheet, *_list_rows(sheet, used)))
     else:
         (folder / DATA).unlink(missing_ok=True)
 

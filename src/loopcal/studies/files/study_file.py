@@ -12,25 +12,12 @@ from typing import Any, NamedTuple
 from loopcal.errors import DataError, LoopcalError
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.penalties import Ridge
+from loopcal.io.core import yaml_file
 from loopcal.io.core.records import get_field_types, read_record
 from loopcal.io.core.text_file import write_text
-from loopcal.io.core.yaml_file import (
-    Location,
-    YamlFile,
-    find_file_beside,
-    quote_scalar,
-    read_yaml,
-    refuse_unknown_keys,
-)
 from loopcal.io.data.measurement_file import load_poses
 from loopcal.io.file_schemas import SchemaMaker
-from loopcal.io.robot.robot_file import (
-    check_format,
-    find_robot_file,
-    get_source,
-    list_shipped_robots,
-    load_robot,
-)
+from loopcal.io.robot import robot_file
 from loopcal.mechanism.model import Mechanism
 from loopcal.studies.simulation.machines import (
     check_effects,
@@ -87,9 +74,9 @@ class StudyContent(NamedTuple):
     quick tier, below `quick`.
     """
 
-    file: YamlFile
+    file: yaml_file.YamlFile
     values: Mapping[str, Any]
-    places: Mapping[str, Location]
+    places: Mapping[str, yaml_file.Location]
 
 
 def load_study(path: str | Path, quick: bool = False) -> Study:
@@ -105,13 +92,13 @@ def load_study(path: str | Path, quick: bool = False) -> Study:
     ------
     FileError : what does not fit, at its line.
     """
-    return parse_study(read_yaml(path, "study file"), quick)
+    return parse_study(yaml_file.read_yaml(path, "study file"), quick)
 
 
-def parse_study(file: YamlFile, quick: bool = False) -> Study:
+def parse_study(file: yaml_file.YamlFile, quick: bool = False) -> Study:
     """Return the study of the content of a study file; parameters and errors as `load_study`."""
-    check_format(file, 1)
-    refuse_unknown_keys(file, list(file.content), ["format", *SETTINGS, *FACTORS, QUICK])
+    robot_file.check_format(file, 1)
+    yaml_file.refuse_unknown_keys(file, list(file.content), ["format", *SETTINGS, *FACTORS, QUICK])
     full = {key: value for key, value in file.content.items() if key not in ("format", QUICK)}
     whole = StudyContent(file, full, {key: (key,) for key in full})
     study, short = build_study(whole), build_study(_apply_quick_tier(whole))
@@ -131,7 +118,7 @@ def _apply_quick_tier(content: StudyContent) -> StudyContent:
             (QUICK,),
         )
     allowed = [key for key in SETTINGS if key != "title"]
-    refuse_unknown_keys(file, list(stated), [*allowed, *FACTORS], (QUICK,))
+    yaml_file.refuse_unknown_keys(file, list(stated), [*allowed, *FACTORS], (QUICK,))
     places = {key: (QUICK, key) for key in stated}
     return StudyContent(file, {**content.values, **stated}, {**content.places, **places})
 
@@ -180,7 +167,7 @@ def _load_pose_files(
             continue
         if len(stated) > 1:
             raise file.error("a file of poses needs no other setting. Remove the others", key_place)
-        path = find_file_beside(file, stated["file"], key_place)
+        path = yaml_file.find_file_beside(file, stated["file"], key_place)
         if path is None:
             raise file.error(f"the folder of the study file lacks {stated['file']!r}", key_place)
         try:
@@ -204,15 +191,17 @@ def read_robots(content: StudyContent) -> dict[str, tuple[Robot, Mechanism]]:
         if not isinstance(value, str):
             raise file.error(f"the robot {name!r} must be a name or a file", place)
         try:
-            path = find_file_beside(file, value, place) or find_robot_file(value)
-            robot = load_robot(path)
+            path = yaml_file.find_file_beside(file, value, place) or robot_file.find_robot_file(
+                value
+            )
+            robot = robot_file.load_robot(path)
         except LoopcalError as error:
             raise file.error(f"cannot read the robot {name!r}: {error}", place) from None
-        robots[name] = (Robot(value, get_source(robot).file.text), robot)
+        robots[name] = (Robot(value, robot_file.get_source(robot).file.text), robot)
     return robots
 
 
-def _list_items(content: StudyContent, key: str) -> Iterator[tuple[str, Any, Location]]:
+def _list_items(content: StudyContent, key: str) -> Iterator[tuple[str, Any, yaml_file.Location]]:
     """Yield name, content and location of the levels of a factor; a plain value is its own name."""
     file, node, place = content.file, content.values[key], content.places[key]
     if isinstance(node, dict):
@@ -231,7 +220,7 @@ def _list_items(content: StudyContent, key: str) -> Iterator[tuple[str, Any, Loc
         yield name, value, level_place
 
 
-def _name(file: YamlFile, value: Any, place: Location) -> str:
+def _name(file: yaml_file.YamlFile, value: Any, place: yaml_file.Location) -> str:
     """Return the name of a level that is a plain value."""
     if isinstance(value, bool) or not isinstance(value, str | int | float):
         raise file.error(
@@ -314,17 +303,19 @@ def write_template(path: Path, robot: str) -> None:
 
     Raises FileError: there is no such robot, it cannot be read, or the file cannot be written.
     """
-    load_robot(robot)
+    robot_file.load_robot(robot)
     text = (files("loopcal.studies.files") / "template.yaml").read_text("utf-8")
-    write_text(path, text.replace("[ROBOT]", f"[{quote_scalar(name_robot(path, robot))}]"))
+    write_text(
+        path, text.replace("[ROBOT]", f"[{yaml_file.quote_scalar(name_robot(path, robot))}]")
+    )
 
 
 def name_robot(path: Path, robot: str) -> str:
     """Return how a study file names a robot: a shipped one by its name, another one by its file,
     relative to the study file where it is in the same folder or below.
     """
-    if robot in list_shipped_robots():
+    if robot in robot_file.list_shipped_robots():
         return robot
-    file, folder = find_robot_file(robot).resolve(), path.parent.resolve()
+    file, folder = robot_file.find_robot_file(robot).resolve(), path.parent.resolve()
     named = file.relative_to(folder) if file.is_relative_to(folder) else file
     return named.as_posix()
