@@ -13,6 +13,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from benchmarks.bench_growth import draw_sessions
 from loopcal.apply.compensation import compensate
 from loopcal.diagnose import bootstrap
 from loopcal.diagnose.bootstrap import Clusters, choose_clusters, compute_robust_spread
@@ -20,11 +21,13 @@ from loopcal.diagnose.residual_patterns import ResidualRows
 from loopcal.estimate.fit_linearization import linearize_fit
 from loopcal.estimate.identification import identify
 from loopcal.estimate.observation_rows import list_block_labels
+from loopcal.estimate.pose_estimate import fit_nuisance_values
 from loopcal.io.core.csv_table import read_table
 from loopcal.io.data.measurement_file import load_measurements, load_pose_names
 from loopcal.io.robot.robot_file import load_robot
 from loopcal.io.runs.result_files import format_compensation, load_targets
 from loopcal.measure.measurements import Measurements
+from loopcal.mechanism.solutions import forward
 from loopcal.report.calibration_view import view_compensation
 from tests.diagnose.correlated_data import ROBOTS, draw_errors, make_rows, measure
 
@@ -94,6 +97,18 @@ def test_compensation_and_its_table_are_linear_in_the_targets() -> None:
     work(10)
     few, many = work(100), work(400)
     assert (many - few) / few < 3.5
+
+
+def test_setup_parameters_of_all_sessions_are_fitted_at_once() -> None:
+    robot = load_robot("hexapod-42")
+
+    def work(sessions: int) -> int:
+        data = draw_sessions(robot, 4 * sessions, sessions, 3)
+        T, nuisance = forward(robot, data.readings).T, data.nuisance_parameters
+        fit_nuisance_values(robot, data, T, nuisance)
+        return count_calls(lambda: fit_nuisance_values(robot, data, T, nuisance))
+
+    assert work(MORE * 4) < 3 * work(4)
 
 
 @pytest.mark.parametrize("read", ["poses", "targets", "measurements"])
