@@ -24,15 +24,7 @@ from numpy.typing import ArrayLike
 
 from loopcal import geometry
 from loopcal.checks import check_choice
-from loopcal.diagnose.error_frames import (
-    FITTED,
-    RELATIVE,
-    ErrorFrame,
-    choose_error_frame,
-    fit_unfixed_frames,
-    linearize_tool_errors,
-    solve_home,
-)
+from loopcal.diagnose import error_frames
 from loopcal.diagnose.fit_examination import ROUNDING
 from loopcal.diagnose.gauge_freedoms import NO_MOTION, twist_weights
 from loopcal.engine import State
@@ -154,7 +146,7 @@ def pose_uncertainty(
     fit: Identification | Posterior,
     poses: ArrayLike | Solution,
     axes: Axes = "base",
-    frame: str = FITTED,
+    frame: str = error_frames.FITTED,
     point: Point = "tool",
     origin: Solution | None = None,
     origin_name: str = "1",
@@ -187,9 +179,9 @@ def pose_uncertainty(
     posterior = fit.posterior if isinstance(fit, Identification) else fit
     robot = posterior.robot
     solution = poses if isinstance(poses, Solution) else inverse(robot, poses)
-    if frame == RELATIVE and origin is None:
+    if frame == error_frames.RELATIVE and origin is None:
         origin = solution.take(np.arange(1))
-    chosen = choose_error_frame(posterior, frame, origin, origin_name)
+    chosen = error_frames.choose_error_frame(posterior, frame, origin, origin_name)
     blocks = []
     for first in range(0, len(solution.q), BLOCK):
         rows = np.arange(first, min(first + BLOCK, len(solution.q)))
@@ -201,13 +193,13 @@ def pose_uncertainty(
 
 
 def _compute_covariance(
-    posterior: Posterior, solution: Solution, frame: ErrorFrame, H: FloatArray
+    posterior: Posterior, solution: Solution, frame: error_frames.ErrorFrame, H: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Return the covariance (n, 6, 6) of poses, and its degrees of freedom as `PoseDegrees`.
 
     H (n, 6, 6) takes twists in base axes to the wanted point and axes.
     """
-    errors, squares = linearize_tool_errors(posterior, solution, frame, H), []
+    errors, squares = error_frames.linearize_tool_errors(posterior, solution, frame, H), []
     if (slow := posterior.discrepancy) is not None:
         squares += slow.split_squares(errors.by_discrepancy[..., : -len(slow.degrees)])
         posterior = posterior.without_discrepancy
@@ -367,7 +359,7 @@ def accuracy_map(
     poses: ArrayLike | int = 400,
     seed: int = 0,
     axes: Axes = "base",
-    frame: str = FITTED,
+    frame: str = error_frames.FITTED,
 ) -> AccuracyMap:
     """Compute the uncertainty of poses over the workspace, and compare it with the measured poses.
 
@@ -386,7 +378,7 @@ def accuracy_map(
     """
     robot = (fit.posterior if isinstance(fit, Identification) else fit).robot
     coordinates = resolve_poses(robot, poses, seed)
-    home = solve_home(robot)
+    home = error_frames.solve_home(robot)
     compute = partial(
         pose_uncertainty, fit, axes=axes, frame=frame, origin=home, origin_name="home"
     )
@@ -485,7 +477,7 @@ def simulate_accuracy(
             posterior = compute_trial_posterior(fits, batch, int(np.flatnonzero(valid)[0]))
         if posterior is None:
             continue
-        frames = fit_unfixed_frames(posterior)
+        frames = error_frames.fit_unfixed_frames(posterior)
         if frames.motions.shape[1]:
             closed, reference = _compare_with_truth(fits, batch, measured.readings)
             valid &= closed

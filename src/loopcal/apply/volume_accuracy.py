@@ -25,13 +25,7 @@ from numpy.typing import ArrayLike
 from loopcal.apply.accuracy import BLOCK, PoseUncertainty, pose_uncertainty
 from loopcal.apply.conformity import Conformity, judge_draws, report_decision
 from loopcal.checks import check_choice
-from loopcal.diagnose.error_frames import (
-    FITTED,
-    ErrorFrame,
-    choose_error_frame,
-    linearize_tool_errors,
-    solve_home,
-)
+from loopcal.diagnose import error_frames
 from loopcal.errors import DataError, EstimationError, UnitError
 from loopcal.estimate.posterior import Posterior
 from loopcal.estimate.residual_test import LEVEL
@@ -293,7 +287,7 @@ class VolumeAccuracy(Result):
 def bound_errors(
     fit: Identification | Posterior,
     volume: VolumeLike,
-    frame: str = FITTED,
+    frame: str = error_frames.FITTED,
     seed: int = 0,
     limit: float | None = None,
 ) -> VolumeAccuracy:
@@ -316,8 +310,8 @@ def bound_errors(
         errors there. DataError : the volume does not suit the robot.
     """
     posterior, volume = fit.posterior if isinstance(fit, Identification) else fit, as_volume(volume)
-    robot, home = posterior.robot, solve_home(posterior.robot)
-    chosen = choose_error_frame(posterior, frame, home, "home")
+    robot, home = posterior.robot, error_frames.solve_home(posterior.robot)
+    chosen = error_frames.choose_error_frame(posterior, frame, home, "home")
     compute = partial(pose_uncertainty, posterior, frame=frame, origin=home, origin_name="home")
     grids, refinement = volume.list_grids(robot), math.nan
     grid, is_list = next(grids), volume.points is not None
@@ -379,7 +373,7 @@ class _DrawnErrors(NamedTuple):
 def _draw_errors(
     posterior: Posterior,
     compute: Callable[[Solution], PoseUncertainty],
-    frame: ErrorFrame,
+    frame: error_frames.ErrorFrame,
     is_list: bool,
     seed: int,
     solution: Solution,
@@ -404,7 +398,7 @@ def _draw_errors(
     common: FloatArray | None = None
     for first in range(0, len(solution.q), BLOCK // 4):
         part = solution.take(np.arange(first, min(first + BLOCK // 4, len(solution.q))))
-        errors = linearize_tool_errors(posterior, part, frame)
+        errors = error_frames.linearize_tool_errors(posterior, part, frame)
         others = (errors.by_readings, errors.by_discrepancy)
         others = others[::-1] if is_list else others
         effects = np.concatenate([errors.by_parameters @ root, errors.by_frame, *others], axis=2)

@@ -30,20 +30,13 @@ from loopcal.diagnose.row_errors import (
     join_errors,
 )
 from loopcal.errors import DataError, EstimationError
+from loopcal.estimate import penalties
 from loopcal.estimate.fit_descent import sum_squares
 from loopcal.estimate.free_parameters import free_only, select_free_parameters
 from loopcal.estimate.identification import check_types, exclude_poses, identify
 from loopcal.estimate.information import collect_information
 from loopcal.estimate.observation_rows import linked_blocks
 from loopcal.estimate.options import FitOptions, merge_options
-from loopcal.estimate.penalties import (
-    GCV,
-    MarginalLikelihood,
-    Method,
-    Ridge,
-    TruncatedSVD,
-    TruncationGCV,
-)
 from loopcal.estimate.problem import problem_of
 from loopcal.findings import Finding, report_finding
 from loopcal.measure.measurements import Measurements
@@ -123,7 +116,7 @@ def draw_folds(data: Measurements, count: int, seed: int) -> tuple[IntArray, ...
 def cross_validate(
     robot: Mechanism,
     data: Measurements,
-    method: Method | None = None,
+    method: penalties.Method | None = None,
     *,
     options: FitOptions | None = None,
     count: int = 5,
@@ -203,7 +196,7 @@ def _fit_folds(
 
 
 def score_leave_one_out(
-    robot: Mechanism, data: Measurements, methods: tuple[Method, ...]
+    robot: Mechanism, data: Measurements, methods: tuple[penalties.Method, ...]
 ) -> tuple[FloatArray, FloatArray, int]:
     """Score k methods that keep the columns as they are: ridge, truncation, least squares, MAP.
 
@@ -400,7 +393,7 @@ def choose_model(
     robot: Mechanism,
     data: Measurements,
     nested: Mapping[str, Sequence[str]] | None = None,
-    method: Method | None = None,
+    method: penalties.Method | None = None,
     *,
     options: FitOptions | None = None,
     count: int = 5,
@@ -586,10 +579,10 @@ def compute_regularization_curves(
     linearization = problem.linearize(z, problem.start(z))
     d = decompose(linearization.factor, linearization.equations, z)
     rules_lam = [
-        ChosenValue("GCV", float(GCV()(d)[0])),
-        ChosenValue("marginal likelihood", float(MarginalLikelihood()(d)[0])),
+        ChosenValue("GCV", float(penalties.GCV()(d)[0])),
+        ChosenValue("marginal likelihood", float(penalties.MarginalLikelihood()(d)[0])),
     ]
-    rules_k = [ChosenValue("GCV", float(TruncationGCV()(d)[0]))]
+    rules_k = [ChosenValue("GCV", float(penalties.TruncationGCV()(d)[0]))]
     # from hardly any effect on the weakest determined direction to hardly any use of the data, with
     # 1 (the spreads as a prior) and about what rules choose
     square, by_rules = d.singular_values[0] ** 2, [rule.value for rule in rules_lam]
@@ -603,7 +596,7 @@ def compute_regularization_curves(
     # what the rules choose has its own score
     lam = np.union1d(lam, by_rules)
     k = np.union1d(k, [int(rule.value) for rule in rules_k])
-    methods = (*map(Ridge, lam.tolist()), *(TruncatedSVD(int(i)) for i in k))
+    methods = (*map(penalties.Ridge, lam.tolist()), *(penalties.TruncatedSVD(int(i)) for i in k))
     if problem.nuisance is None:
         scheme: Scheme = "leave-one-out"
         score, error, left_out = score_leave_one_out(fit.robot, data, methods)

@@ -26,14 +26,7 @@ import numpy as np
 
 from loopcal import geometry
 from loopcal.checks import check_choice
-from loopcal.diagnose.gauge_freedoms import (
-    find_gauge_freedoms,
-    find_moving_frames,
-    observe_motions,
-    probe_readings,
-    twist_weights,
-    weigh_motions,
-)
+from loopcal.diagnose import gauge_freedoms
 from loopcal.errors import EstimationError
 from loopcal.estimate.information import MOTIONS, frame_twists
 from loopcal.estimate.posterior import Posterior
@@ -128,7 +121,7 @@ def fit_frames(robot: Mechanism, T: FloatArray, motions: FloatArray) -> FrameFit
     Rotations count times the robot's size, and displacements are those of the tool.
     """
     arm, m = T[:, :3, :3] @ robot.tool[:3, 3], len(T)
-    weight = twist_weights(robot.size)[:, None] * geometry.transport_matrix(arm)
+    weight = gauge_freedoms.twist_weights(robot.size)[:, None] * geometry.transport_matrix(arm)
     by_frames = (weight @ frame_twists(T, robot.size)).reshape(6 * m, MOTIONS)
     u, s, vt = np.linalg.svd(by_frames @ motions, full_matrices=False)
     # where the orientation is constant, opposite motions of both frames move nothing
@@ -264,7 +257,7 @@ def list_unfixed_motions(posterior: Posterior) -> FloatArray:
     if posterior.determined.all():
         return known
     of_null = (posterior.places, posterior.unit, posterior.undetermined)
-    moved = find_gauge_freedoms(posterior.robot, *of_null).motions
+    moved = gauge_freedoms.find_gauge_freedoms(posterior.robot, *of_null).motions
     u, s, _ = np.linalg.svd(np.concatenate([known, moved], axis=1), full_matrices=False)
     return u[:, s > FIT_TOLERANCE]
 
@@ -277,8 +270,8 @@ def reference_poses(posterior: Posterior) -> ReferencePoses:
     if frames is not None and _names_readings(posterior):
         readings, where = frames.readings, "measured"
     else:
-        readings, where = probe_readings(robot), "home"
-    T, D = observe_motions(robot, readings)
+        readings, where = gauge_freedoms.probe_readings(robot), "home"
+    T, D = gauge_freedoms.observe_motions(robot, readings)
     return ReferencePoses(T, list_error_twists(posterior, T, D[:, :, posterior.places]), where)
 
 
@@ -299,12 +292,12 @@ def _names_readings(posterior: Posterior) -> bool:
 
 def _moved_frames(fit: FrameFit, motion: FloatArray, twists: FloatArray) -> tuple[str, ...]:
     """Return which frames a motion (12, p) that fits twists (m, 6, p) moves: the fewest."""
-    motions, base, platform = weigh_motions(fit.poses, fit.size, twists)
+    motions, base, platform = gauge_freedoms.weigh_motions(fit.poses, fit.size, twists)
     moved = np.concatenate([base, platform], axis=1) @ motion
     length = float(np.linalg.norm(moved))
     if not length > FIT_TOLERANCE * np.linalg.norm(motions):
         return ()
-    return find_moving_frames(moved, base, platform, FIT_TOLERANCE * length)
+    return gauge_freedoms.find_moving_frames(moved, base, platform, FIT_TOLERANCE * length)
 
 
 def _as_base_motion(by_base: FloatArray, twists: FloatArray) -> FloatArray:
@@ -363,7 +356,7 @@ def linearize_tool_errors(
         H @ frame.own_errors(solution.T),
         H @ (S.readings[0] * posterior.repeatability),
         by_discrepancy,
-        np.linalg.norm(D[..., :p] * twist_weights(robot.size)[:, None], axis=(1, 2)),
+        np.linalg.norm(D[..., :p] * gauge_freedoms.twist_weights(robot.size)[:, None], axis=(1, 2)),
         frame.describe(axes=""),
     )
 

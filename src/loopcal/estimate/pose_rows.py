@@ -55,16 +55,8 @@ from loopcal.measure.kinds.kind import Evaluation
 from loopcal.mechanism.actuation import drive_joints
 from loopcal.mechanism.kinematics import WIDE, is_square
 from loopcal.mechanism.sensitivity import fold_pose_rows
+from loopcal.numerics import elimination
 from loopcal.numerics.decomposition import NULL_COMPONENT, empty_factor
-from loopcal.numerics.elimination import (
-    Elimination,
-    EliminationTree,
-    NodeFactors,
-    eliminate_columns,
-    eliminate_tree,
-    find_connected_groups,
-    spread_columns,
-)
 from loopcal.numerics.gauss_newton import Halving, minimize_by_halving
 from loopcal.numerics.statistics import find_distinct
 from loopcal.numerics.trial_batch import map_arrays
@@ -87,7 +79,7 @@ class _Point:
     squares: FloatArray
     gain: FloatArray
     solutions: list[tuple[IntArray, ComponentGroup, FloatArray]]
-    factors: NodeFactors | None
+    factors: elimination.NodeFactors | None
     rank: IntArray
     is_unobservable: BoolArray
 
@@ -429,7 +421,7 @@ class PoseRows:
         group: ComponentGroup,
         kinds: Sequence[KindRows | None],
         nuisance: NuisanceElimination | None,
-    ) -> tuple[Elimination, FloatArray]:
+    ) -> tuple[elimination.Elimination, FloatArray]:
         """Eliminate the coordinates of a group's components from their stacked rows.
 
         Return also the sums of squares (a, C) before.
@@ -437,7 +429,7 @@ class PoseRows:
         tree, k = None if nuisance is None else nuisance.tree, self.coordinates.count
         rows = stack_rows(block, group, kinds, k, tree)
         squares = (rows[..., -1] ** 2).sum(axis=2)
-        return eliminate_columns(rows, group.poses.shape[1] * k), squares
+        return elimination.eliminate_columns(rows, group.poses.shape[1] * k), squares
 
 
 class PoseSearch:
@@ -492,7 +484,7 @@ class PoseSearch:
         tree, factors = None, None
         if self.nuisance is not None:
             tree = self.nuisance.tree
-            factors = NodeFactors(tree, a, 0)
+            factors = elimination.NodeFactors(tree, a, 0)
         squares, gain, cost = np.zeros((a, components)), np.zeros(a), np.zeros(a)
         rank = np.zeros((a, components), dtype=np.int64)
         is_unobservable = np.zeros((a, n, k), dtype=bool)
@@ -562,7 +554,7 @@ class PoseSearch:
         rows, a, nuisance, change = self.rows, len(self.values), None, point.gain
         u = np.zeros((a, len(rows.member), rows.coordinates.count))
         if point.factors is not None:
-            done, _ = eliminate_tree(point.factors)
+            done, _ = elimination.eliminate_tree(point.factors)
             nuisance, change = done.shift, change + done.explained
         for numbers, group, solution in point.solutions:
             right = np.ones((a, len(numbers), 1))
@@ -721,7 +713,7 @@ def find_components(n: int, rows: Sequence[ObservationRows], coordinates: int) -
     """
     pairs = [consecutive_pairs(r.poses) for r in rows if r.poses.ndim > 1]
     links = np.concatenate([np.zeros((0, 2), dtype=np.int64), *pairs])
-    member = find_connected_groups(links, n)
+    member = elimination.find_connected_groups(links, n)
     largest = int(np.bincount(member).max())
     if largest * coordinates > LARGEST:
         unknowns = largest * coordinates
@@ -785,7 +777,7 @@ def stack_rows(
     group: ComponentGroup,
     kinds: Sequence[KindRows | None],
     coordinates: int,
-    tree: EliminationTree | None,
+    tree: elimination.EliminationTree | None,
 ) -> FloatArray:
     """Stack the rows of a group's components, [u | nuisance | machine | residual], into (a, C,
     height, L k + w + p + 1).
@@ -810,7 +802,7 @@ def stack_rows(
             out[(*cells, slice(first + w, -1))] = kind.by_parameters[:, rows]
         if w and tree is not None and kind.by_nuisance is not None:
             columns = tree.columns(group.nodes[component], observed.nuisance[rows])
-            spread = spread_columns(kind.by_nuisance[:, rows], columns, w)
+            spread = elimination.spread_columns(kind.by_nuisance[:, rows], columns, w)
             out[(*cells, slice(first, first + w))] = spread
         if kind.by_coordinates is None:
             continue

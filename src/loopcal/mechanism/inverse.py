@@ -17,15 +17,8 @@ from numpy.typing import NDArray
 
 from loopcal import engine, geometry
 from loopcal.engine import CONVERGED, EXHAUSTED, NOT_FINITE, STALLED, State
+from loopcal.mechanism import chains
 from loopcal.mechanism.actuation import OpenSums, list_open_sums, scale_sums
-from loopcal.mechanism.chains import (
-    find_carrying_actuators,
-    has_spare_drives,
-    join_stage_states,
-    list_carrying_stages,
-    locate_stage_bases,
-    split_stage_states,
-)
 from loopcal.mechanism.kinematics import Loops, compute_closure_sign, solve_serial
 from loopcal.mechanism.limb_rows import follow_links, place_serial
 from loopcal.mechanism.model import Mechanism, Stage
@@ -133,7 +126,7 @@ def moves_by_drives(robot: Mechanism) -> bool:
     ones would be free.
     """
     is_open = robot.program.may_stay_open and not robot.has_redundant_sums
-    return bool(robot.stages or robot.assembly.held) or is_open or has_spare_drives(robot)
+    return bool(robot.stages or robot.assembly.held) or is_open or chains.has_spare_drives(robot)
 
 
 # Inverse kinematics by the forward one: Newton's method on the driven joints, c(T(u)) = c*.
@@ -243,11 +236,11 @@ class _Rows:
                 moved.append((state.T[:, 0], by_drive))
                 states.append(state)
                 ok &= state.status[:, 0] == CONVERGED
-            bases, platforms = locate_stage_bases(stages, [T for T, _ in moved])
+            bases, platforms = chains.locate_stage_bases(stages, [T for T, _ in moved])
             D, T = np.zeros((len(u), 6, u.shape[1])), platforms[-1]
             # frames and advances of joints in serial stages, zero for others
             joints, advance = np.zeros((*u.shape, 4, 4)), np.zeros(u.shape)
-            for i in list_carrying_stages(self.robot):
+            for i in chains.list_carrying_stages(self.robot):
                 (_, by_drive), links, drives = moved[i], self.links[i], stages[i].actuators
                 if links is not None:
                     for column, frame in enumerate(by_drive, drives.start):
@@ -393,7 +386,7 @@ class _Rows:
             else next(loops)
             for stage, e in zip(self.robot.blocks, self.e, strict=True)
         ]
-        return join_stage_states(self.robot, states)
+        return chains.join_stage_states(self.robot, states)
 
 
 def _select_drives(stage: Stage, u: FloatArray) -> FloatArray:
@@ -473,14 +466,14 @@ def _make_rows(robot: Mechanism, values: FloatArray, target: FloatArray) -> _Row
         np.zeros(len(target)),
         np.array(turns),
         measure_spans(robot, np.array(turns)),
-        find_carrying_actuators(robot),
+        chains.find_carrying_actuators(robot),
     )
 
 
 def measure_spans(robot: Mechanism, turns: BoolArray) -> FloatArray:
     """Return the `spans` of the drives (u,) of a robot."""
     spans = np.where(turns, 2 * np.pi, robot.size)
-    if has_spare_drives(robot):
+    if chains.has_spare_drives(robot):
         _, drives = robot.slots(robot.values[None])
         at_rest = ((np.nan if a.reference is None else a.reference,) * 2 for a in robot.actuators)
         strokes = np.array([a.stroke or e for a, e in zip(robot.actuators, at_rest, strict=True)])
@@ -497,7 +490,7 @@ def measure_spans(robot: Mechanism, turns: BoolArray) -> FloatArray:
 def _begin(rows: _Rows, first: State) -> _Iterate:
     """Return the iterates of a state (R, 1)."""
     u, loops = np.zeros((len(first.T), len(rows.robot.actuators))), list[State]()
-    states = split_stage_states(rows.robot, first)
+    states = chains.split_stage_states(rows.robot, first)
     for stage, own, sums in zip(rows.robot.blocks, states, rows.sums, strict=True):
         joints = driven_values(stage.robot.program, own)
         joints = joints if sums is None else sums.read(joints)

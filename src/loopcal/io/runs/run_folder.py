@@ -40,13 +40,8 @@ from loopcal.estimate.posterior import Posterior, posterior_from_arrays
 from loopcal.estimate.residual_test import NoiseKnowledge
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
+from loopcal.io.core import outputs
 from loopcal.io.core.limits import ARRAYS_COUNT, ARRAYS_SIZE, TABLE_SIZE, FileLimit
-from loopcal.io.core.outputs import (
-    FolderKind,
-    describe_leftover,
-    list_changed_files,
-    write_result_folder,
-)
 from loopcal.io.core.records import read_record
 from loopcal.io.core.text_file import as_path, open_bytes, read_json, sha256
 from loopcal.io.core.yaml_file import YamlFile, read_yaml
@@ -598,7 +593,7 @@ def list_inputs(result: Mapping[str, Any]) -> dict[str, Mapping[str, str]]:
 
 
 ARRAYS = "arrays.npz"
-RUN = FolderKind("run", RESULT, ("made_by", "fit"), (ARRAYS, ROBOT, FAILED_ROBOT))
+RUN = outputs.FolderKind("run", RESULT, ("made_by", "fit"), (ARRAYS, ROBOT, FAILED_ROBOT))
 # Keys of `made_by` and their meanings, for the file reference.
 MADE_BY: Mapping[str, str] = {
     "command": "the command line, as a list of words",
@@ -635,7 +630,7 @@ def write_run_folder(
         robot_name: robot_text.encode(),
         ARRAYS: lambda file: np.savez(file, allow_pickle=False, **arrays),
     }
-    write_result_folder(path, RUN, result, files, force)
+    outputs.write_result_folder(path, RUN, result, files, force)
     return path
 
 
@@ -648,7 +643,7 @@ def read_run_folder(path: str | Path) -> tuple[dict[str, Any], dict[str, np.ndar
     if not (path / RESULT).is_file():
         is_folder = f"is not a run folder ({RESULT} is missing)"
         sentence = f"this {is_folder if path.exists() else 'run folder does not exist'}"
-        leftover = "" if path.exists() else describe_leftover(path, RESULT)
+        leftover = "" if path.exists() else outputs.describe_leftover(path, RESULT)
         advice = leftover or "name a folder that a calibration wrote"
         raise FileError(f"{sentence}; {advice}", path)
     names = (ARRAYS, _find_robot_file(path).name)
@@ -752,7 +747,7 @@ def load_run(path: str | Path) -> Run:
 
 def refuse_changed_run(run: Run) -> None:
     """Raise FileError where a file of a run folder is not the one that the calibration wrote."""
-    changed = list_changed_files(run.path, RUN)
+    changed = outputs.list_changed_files(run.path, RUN)
     if changed:
         raise FileError.of("files.run-changed", run.path, files=changed)
 
