@@ -208,7 +208,7 @@ def test_uncalibrated_five_bar_exports_to_the_same_urdf_file(loopcal, folder, da
     source = data_folder / "urdf_closures" / "5bar_linkage" / "robot.urdf"
     loopcal(
         f"import {source} -o five-bar.yaml",
-        "5 rigid bodies with the base (of 8 links), 5 joints (1 close loops), 2 motors, mobility 2",
+        "5 rigid bodies with the base (of 8 links), 5 joints (1 closes a loop), 2 motors",
     )
     loopcal(f"export five-bar.yaml --format urdf --into {source} -o same.urdf")
     assert (folder / "same.urdf").read_bytes() == source.read_bytes()

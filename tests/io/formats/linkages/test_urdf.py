@@ -45,7 +45,8 @@ def test_counts_of_bodies_joints_loops_and_mobility_are_reported(files, read, na
     assert joints - (bodies - 1) == loops
     first, second = map(str, read[name][0].findings[:2])
     assert f"{bodies} rigid bodies with the base" in first
-    assert f"{joints} joints ({loops} close loops), 2 motors, mobility {mobility}" in first
+    closing = "closes a loop" if loops == 1 else "close loops"
+    assert f"{joints} joints ({loops} {closing}), 2 motors, mobility {mobility}" in first
     assert float(re.findall(r"residual at home (\S+) m", second)[0]) < 1e-12  # [m]
 
 
