@@ -49,9 +49,12 @@ FILM = 28  # EXIF: focal length for film of 35 mm, in whole millimeters as phone
 
 
 def write_files(
-    folder: Path, machine: Machine, scene: Scene, rng: np.random.Generator
+    folder: Path, machine: Machine, scene: Scene, rng: np.random.Generator, draw: bool = True
 ) -> tuple[Board, Array]:
-    """Write board file, poses.csv and pictures of a scene; return the board and its scales."""
+    """Write board file, poses.csv and pictures of a scene; return the board and its scales.
+
+    draw : whether to write pictures.
+    """
     scale = 1.0 + PRINT_SD * rng.standard_normal(2)
     board = choose_board(CORNERS[0] + 1, CORNERS[1] + 1, machine.square)
     x, y = np.array(board.marks) * scale + CALIPER_SD * rng.standard_normal(2)
@@ -67,10 +70,12 @@ def write_files(
     exif.get_ifd(0x8769)[0xA405] = FILM
     for i, (q, at) in enumerate(zip(scene.q, scene.x, strict=True)):
         seen = scene.locate_board(machine, at)
-        picture = render(
-            board, seen, scene.lens, SIZE, seed=i, scale=tuple(scale), blur=0.5, fine=1
-        )
-        Picture.fromarray(picture).save(folder / "pictures" / f"p{i}.jpg", quality=95, exif=exif)
+        if draw:
+            picture = render(
+                board, seen, scene.lens, SIZE, seed=i, scale=tuple(scale), blur=0.5, fine=1
+            )
+            path = folder / "pictures" / f"p{i}.jpg"
+            Picture.fromarray(picture).save(path, quality=95, exif=exif)
         lines.append(",".join([f"p{i}", *(f"{value:.12g}" for value in q)]))
     (folder / "poses.csv").write_text("\n".join(lines) + "\n")
     return board, scale
