@@ -34,7 +34,7 @@ from loopcal.io.pictures import Picture, format_pictures, read_board
 from loopcal.io.robot.robot_file import load_robot
 from tests.io.boards import project_corners
 
-MACHINES = {"hexapod": 60, "delta": 20, "five-bar": 20}
+MACHINES = {"hexapod": 80, "delta": 20, "five-bar": 20}
 CORNER_SD = 0.015  # [px]
 FOCAL = 3111.0  # by EXIF [px]
 DRAWS = 2000
