@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from loopcal.checks import check_choice
 from loopcal.errors import DataError
+from loopcal.measure import simulation
 from loopcal.measure.data_checks import check_strokes, find_outside_strokes
 from loopcal.measure.instrument import SIGMA, Gaussian, Instrument, Noise, Sensor, Uniform
 from loopcal.measure.kinds import KINDS
@@ -22,13 +23,6 @@ from loopcal.measure.kinds.position import TargetKind
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.nuisance import StatedValue
 from loopcal.measure.readings import list_joint_dimensions
-from loopcal.measure.simulation import (
-    reach_poses,
-    replace_measured_values,
-    sample_truth,
-    simulate,
-    simulate_contacts,
-)
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.solutions import inverse
 from loopcal.mechanism.states import Status
@@ -76,7 +70,7 @@ def simulate_measurements(
     skipped: tuple[str, ...] = ()
     if skip_unreachable:
         commanded = inverse(truth.nominal, targets)
-        _, state = reach_poses(truth, truth.values[None], commanded.q, commanded.state)
+        _, state = simulation.reach_poses(truth, truth.values[None], commanded.q, commanded.state)
         reached = state.status[0] == Status.CONVERGED
         inside = ~find_outside_strokes(commanded.q, truth).any(axis=1)
         is_kept = commanded.converged & reached & inside
@@ -91,7 +85,9 @@ def simulate_measurements(
             targets, kept = targets[is_kept], np.flatnonzero(is_kept).tolist()
             labels, places = [numbers[i] for i in kept], [places[i] for i in kept if places]
     names = (labels, places)
-    data = simulate(truth, targets, instrument, seed, reading_sigma=reading_sigma, pose_names=names)
+    data = simulation.simulate(
+        truth, targets, instrument, seed, reading_sigma=reading_sigma, pose_names=names
+    )
     if labels:
         data = replace(data, labels=tuple(labels))
     check_strokes(data, truth, places=places)
@@ -112,16 +108,16 @@ def fill_in_measurements(
     """
     truth = _choose_truth(robot, draw_errors, seed)
     if are_contacts:
-        data = simulate_contacts(truth, sheet, instrument, seed)
+        data = simulation.simulate_contacts(truth, sheet, instrument, seed)
         check_strokes(data, truth)
     else:
-        data = replace_measured_values(truth, sheet, instrument, seed)
+        data = simulation.replace_measured_values(truth, sheet, instrument, seed)
     return SimulatedMeasurements(data, truth)
 
 
 def _choose_truth(robot: Mechanism, draw_errors: bool, seed: int) -> Mechanism:
     """Return a robot, or one whose values are drawn from its spreads."""
-    return robot.with_values(sample_truth(robot, 1, seed)[0]) if draw_errors else robot
+    return robot.with_values(simulation.sample_truth(robot, 1, seed)[0]) if draw_errors else robot
 
 
 def predict_noise_free(
@@ -140,7 +136,7 @@ def predict_noise_free(
     labels, places : (n,) names of the poses, and their places, for messages. seed : of the poses.
     """
     targets, names = resolve_poses(robot, poses, seed), (labels, places)
-    return simulate(
+    return simulation.simulate(
         robot, targets, instrument, 0, robot, reading_sigma=reading_sigma, pose_names=names
     )
 

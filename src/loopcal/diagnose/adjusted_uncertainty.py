@@ -15,18 +15,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from loopcal.diagnose import model_discrepancy
 from loopcal.diagnose.error_causes import OUTLIERS, explain_residuals
 from loopcal.diagnose.error_frames import (
     FITTED,
     MOST_POSES,
     linearize_tool_errors,
     locate_measured_poses,
-)
-from loopcal.diagnose.model_discrepancy import (
-    SlowErrors,
-    add_slow_errors,
-    exclude_slow_errors,
-    find_slow_errors,
 )
 from loopcal.diagnose.residual_patterns import (
     BLOCK,
@@ -113,10 +108,10 @@ def adjust_uncertainty(
     named = [cause.p_value for cause in explained.causes if cause.source == SMOOTH]
     slow = None
     if not any(cause.source == OUTLIERS for cause in explained.causes[:1]):  # like any error
-        slow = find_slow_errors(linear, T, min([slow_p_value, *named]))
+        slow = model_discrepancy.find_slow_errors(linear, T, min([slow_p_value, *named]))
     if explained.rows is not None:
         fit = _add_patterns(fit, linear, explained, slow, share)
-    return fit if slow is None else add_slow_errors(fit, slow)
+    return fit if slow is None else model_discrepancy.add_slow_errors(fit, slow)
 
 
 def is_explainable(fit: Identification) -> bool:
@@ -128,7 +123,7 @@ def _add_patterns(
     fit: Identification,
     linear: FitLinearization,
     explained: ExplainedResiduals,
-    slow: SlowErrors | None,
+    slow: model_discrepancy.SlowErrors | None,
     share: float,
 ) -> Identification:
     """Return a fit whose covariance allows for the causes of its residuals, and for the correlation
@@ -147,7 +142,7 @@ def _add_patterns(
     shared = [c for c in causes if c.source in (POSE, TARGET, WALK)]
     rest = rows
     if slow is not None and slow.is_slow:
-        rest = exclude_slow_errors(linear, rows, slow)
+        rest = model_discrepancy.exclude_slow_errors(linear, rows, slow)
         effects = [
             e
             for e in effects

@@ -17,21 +17,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from loopcal import engine
+from loopcal.diagnose import outliers
 from loopcal.diagnose.conventions.interpretations import (
     FACTORS,
     list_orders,
     permute_columns,
     with_measured,
-)
-from loopcal.diagnose.outliers import (
-    BlockSearch,
-    Influence,
-    PartialFit,
-    compute_block_influence,
-    iterate_blocks,
-    join_columns,
-    make_empty_influence,
-    search_blocks,
 )
 from loopcal.errors import LoopcalError
 from loopcal.estimate.elimination import NodeRows, fold_node_rows
@@ -99,7 +90,7 @@ class HeldOutBlocks(NamedTuple):
     tree: EliminationTree  # of the variables that predict blocks of one session
     shared: int  # number k of those that predict all blocks
 
-    def fit_without(self, excluded: BoolArray) -> PartialFit:
+    def fit_without(self, excluded: BoolArray) -> outliers.PartialFit:
         """Return the prediction by all blocks that are not excluded (u,)."""
         influence = self.compare(self.combine(excluded), ~excluded)
         inside, scale = (influence.degrees > 0) & ~excluded, 1.0
@@ -109,13 +100,13 @@ class HeldOutBlocks(NamedTuple):
             order = np.argsort(distance / np.sqrt(degrees), kind="stable")
             middle = order[[(len(order) - 1) // 2]]
             scale = max(1.0, estimate_scale_of(distance[middle], degrees[middle].astype(float)))
-        return PartialFit(excluded, influence, scale, 0)
+        return outliers.PartialFit(excluded, influence, scale, 0)
 
-    def compare(self, prediction: Prediction, inside: BoolArray) -> Influence:
+    def compare(self, prediction: Prediction, inside: BoolArray) -> outliers.Influence:
         """Return the influence of every block for a prediction by the blocks that are `inside`
         (u,), and of others.
         """
-        influence, (done, triangle, y) = make_empty_influence(len(self.poses)), prediction
+        influence, (done, triangle, y) = outliers.make_empty_influence(len(self.poses)), prediction
         for structure, numbers, nodes, rows, r, present in self.groups:
             w = rows.shape[2] - self.shared
             own, half, at_best = rows[..., :w], rows[..., w:], r
@@ -130,7 +121,9 @@ class HeldOutBlocks(NamedTuple):
                 half = substitute_transposed(triangle, stacked).T.reshape(half.shape)
             half = np.concatenate([own, half], axis=2)
             weight = inside[numbers].astype(np.float64)
-            influence.fill(numbers, compute_block_influence(half, at_best, present, weight))
+            influence.fill(
+                numbers, outliers.compute_block_influence(half, at_best, present, weight)
+            )
         return influence
 
     def combine(self, excluded: BoolArray) -> Prediction:
@@ -163,7 +156,7 @@ class HeldOutCheck:
 
     predictor: Predictor  # makes the rows of other measurements of the same poses
     blocks: HeldOutBlocks  # those of the data
-    search: BlockSearch  # its result; `suspects` (b,) are the numbers of the blocks that do not fit
+    search: outliers.BlockSearch  # `suspects` (b,) are the numbers of the blocks that do not fit
     suspects: IntArray
 
     @cached_property
@@ -210,7 +203,7 @@ class Predictor(NamedTuple):
             present, c = np.any(columns != 0.0, axis=2) | (r != 0.0), unknowns.shape[1]
             own, machine = columns[..., :c], columns[..., c:]
             used = np.where(unknowns[..., None] >= 0, variables[unknowns], -1)
-            moved, to_own = join_columns(used, root[unknowns])
+            moved, to_own = outliers.join_columns(used, root[unknowns])
             shared = own @ by_shared[unknowns] + machine @ by_shared[len(table.names) :]
             parts.append((blocks, moved, own @ to_own, shared, r, present))
         if tree is None:
@@ -233,7 +226,7 @@ class Predictor(NamedTuple):
         total = problem.poses.count_rows(member, int(member.max(initial=-1)) + 1)
         noise = 1.0 if self.uncertainty is None else self.uncertainty.noise_scale
         rows = problem.rows_at(z, values)
-        for blocks, unknowns, columns, r in iterate_blocks(rows, member, total):
+        for blocks, unknowns, columns, r in outliers.iterate_blocks(rows, member, total):
             yield blocks, unknowns, columns / noise, r / noise
 
     def iterate_rows(
@@ -358,7 +351,7 @@ def check_held_out_rows(
     if not blocks.groups:
         return None
     nothing = np.zeros(len(blocks.poses), dtype=bool)
-    search = search_blocks(blocks.fit_without, nothing, LEVEL)
+    search = outliers.search_blocks(blocks.fit_without, nothing, LEVEL)
     if search.whole.tested == 1:  # only the fit predicts it
         tested = search.whole.influence.degrees > 0
         alone = blocks.fit_without(tested)

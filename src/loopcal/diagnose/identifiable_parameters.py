@@ -19,6 +19,7 @@ import numpy as np
 from loopcal.diagnose.error_causes import report_picture_scale
 from loopcal.diagnose.gauge_freedoms import interpret_combinations, probe_readings
 from loopcal.errors import DataError, EstimationError, MechanismError
+from loopcal.estimate import information
 from loopcal.estimate.determinable_setup import fix_undetermined_setup
 from loopcal.estimate.free_parameters import (
     NEGLIGIBLE,
@@ -30,13 +31,6 @@ from loopcal.estimate.free_parameters import (
     free_only,
     select_free_parameters,
     sparsify_basis,
-)
-from loopcal.estimate.information import (
-    ObservedPoses,
-    collect_information,
-    count_equations,
-    instrument_factor,
-    observe_poses,
 )
 from loopcal.estimate.pose_estimate import find_unclosed_poses, refuse_unreached
 from loopcal.estimate.posterior import Posterior, compute_posterior
@@ -327,7 +321,7 @@ def identifiability(
     if not len(free):
         total = len(robot.parameters)
         raise EstimationError.of("fit.no-free-parameter", robot=robot.name, total=total)
-    count = count_equations(robot, data)
+    count = information.count_equations(robot, data)
     if not count and data.n_rows:
         raise EstimationError.of("fit.no-equation-left", poses=data.n_poses, unknowns=len(free))
     if not count:
@@ -335,7 +329,7 @@ def identifiability(
     unclosed = find_unclosed_poses(robot, data)
     if unclosed.are_most:
         raise EstimationError(unclosed.report("fit.poses-open"))
-    factor, reached = collect_information(free, data)
+    factor, reached = information.collect_information(free, data)
     refuse_unreached(data, np.flatnonzero(~reached))
     decomposition = decompose(factor, np.full(1, count), tolerance=rank_tolerance)
     rows = factor[0, :-1, :-1]
@@ -454,13 +448,13 @@ def suggest_measurements(
     names = [name for name, _ in joints]
     try:
         q = sample_workspace(free.robot, POSES, seed=0).solution.q
-        scene = observe_poses(free, q, names)
+        scene = information.observe_poses(free, q, names)
     except MechanismError:  # no stated workspace
-        scene = observe_poses(free, probe_readings(free.robot), names)
+        scene = information.observe_poses(free, probe_readings(free.robot), names)
     for words, kind in _list_candidates(free.robot, joints):
         try:
             seen = _measure_at(scene, kind, SIGMA | (sigma or {}))
-            X = instrument_factor(scene, seen)[0, :-1, :-1]
+            X = information.instrument_factor(scene, seen)[0, :-1, :-1]
         except DataError:
             continue  # this kind has nothing to measure on this robot
         # combinations that the rows X separate from all others
@@ -533,7 +527,9 @@ def _list_examples(kinds: Iterable[type[Kind]]) -> Iterator[tuple[str, Kind]]:
             yield words, kind
 
 
-def _measure_at(scene: ObservedPoses, kind: Kind, sigma: dict[Dimension, float]) -> Measurements:
+def _measure_at(
+    scene: information.ObservedPoses, kind: Kind, sigma: dict[Dimension, float]
+) -> Measurements:
     """Return noiseless measurements of a kind at the scene."""
     robot = scene.free.robot
     noise = Gaussian(np.array([sigma[column.dimension] for column in kind.noise_columns]))

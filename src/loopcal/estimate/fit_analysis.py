@@ -13,18 +13,13 @@ from typing import Any
 import numpy as np
 
 from loopcal.errors import DataError
+from loopcal.estimate import free_parameters
 from loopcal.estimate.descent import Descent
 from loopcal.estimate.fit_descent import (
     add_loss_uncertainty,
     add_setup_uncertainty,
     get_method,
     report_closure_start,
-)
-from loopcal.estimate.free_parameters import (
-    Combination,
-    FreeParameters,
-    describe_null_space,
-    fix_all,
 )
 from loopcal.estimate.information import FrameRows, UnfixedMotions, describe_frames
 from loopcal.estimate.linearization import Linearization, PoseEstimates
@@ -90,7 +85,7 @@ class FitAnalysis:
     """
 
     robot: Mechanism
-    free: FreeParameters
+    free: free_parameters.FreeParameters
     options: FitOptions
     data: Measurements
     problem: Problem
@@ -212,10 +207,10 @@ class FitAnalysis:
         return describe_regularization(self.method, self.fit.decomposition, self.fit.penalty)
 
     @cached_property
-    def unidentifiable(self) -> tuple[Combination, ...]:
+    def unidentifiable(self) -> tuple[free_parameters.Combination, ...]:
         """Combinations that change no measured value."""
         null_space = self.fit.decomposition.plain().null_space()
-        combinations = describe_null_space(self.free, null_space)
+        combinations = free_parameters.describe_null_space(self.free, null_space)
         return add_followers(combinations, null_space, self.stated_nuisance)
 
     # --- poses and setup where the last step ended
@@ -369,7 +364,7 @@ def fit_setup_alone(
     entries = {entry.name: entry for entry in table.entries}
     stated = ParameterTable(tuple(entries[name] for name in reached_setup.table.names))
     setup, z = replace(reached_setup, table=stated), np.zeros((1, 0))
-    problem = problem_of(fix_all(robot), reached_data, setup)
+    problem = problem_of(free_parameters.fix_all(robot), reached_data, setup)
     try:
         fitted = problem.solve(z, problem.start(z)).nuisance
     except DataError:  # too few rows for a closed form

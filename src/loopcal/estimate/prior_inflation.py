@@ -53,14 +53,9 @@ from loopcal.estimate.tolerance_components import (
     list_shifts,
 )
 from loopcal.findings import Finding, report_finding
+from loopcal.numerics import statistics
 from loopcal.numerics.decomposition import Decomposition, decompose
 from loopcal.numerics.gauss_newton import DescentStatus
-from loopcal.numerics.statistics import (
-    compute_any_probability,
-    compute_chi_square_quantile,
-    compute_chi_square_tail,
-    compute_single_level,
-)
 from loopcal.results.description import Field, fields
 from loopcal.typing import BoolArray, FloatArray
 
@@ -302,8 +297,8 @@ def find_information(size: float, count: int) -> float:
     """Return the E'Q E with which a deviation of `size` tolerances is detected in four of five data
     sets by a test of `count` statistics.
     """
-    level = compute_single_level(LEVEL, 3 * count)
-    threshold = float(np.sqrt(compute_chi_square_quantile(1.0, level)))
+    level = statistics.compute_single_level(LEVEL, 3 * count)
+    threshold = float(np.sqrt(statistics.compute_chi_square_quantile(1.0, level)))
     return ((threshold + POWER_QUANTILE) / size) ** 2
 
 
@@ -574,7 +569,7 @@ def assess_prior_conflict(
     `components` are what the method inflated.
     """
     statistic, degrees = (float(value[0]) for value in compute_prior_statistic(decomposition))
-    p_value, names = float(compute_chi_square_tail(degrees, statistic)), free.names
+    p_value, names = float(statistics.compute_chi_square_tail(degrees, statistic)), free.names
     square = np.where(are_penalized(decomposition), decomposition.singular_values**2, 0.0)[0]
     share, projections = square / (1.0 + square), decomposition.projections[0]
     # the worst direction is named by its largest parts, in spreads
@@ -597,7 +592,7 @@ def assess_prior_conflict(
         p_value=p_value,
         direction=direction,
         parameter=parameter,
-        joint_p_value=compute_any_probability(
+        joint_p_value=statistics.compute_any_probability(
             min(p_value, direction.p_value, parameter.p_value), 3
         ),
         inflation=inflation,
@@ -629,5 +624,7 @@ def _test_largest(
     if count == 0:
         return LargestDeviation(0.0, 0, 1.0, ())
     largest = float(values.max())
-    single = float(compute_chi_square_tail(1.0, largest**2))
-    return LargestDeviation(largest, count, compute_any_probability(single, count), names)
+    single = float(statistics.compute_chi_square_tail(1.0, largest**2))
+    return LargestDeviation(
+        largest, count, statistics.compute_any_probability(single, count), names
+    )

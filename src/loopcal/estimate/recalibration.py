@@ -29,18 +29,7 @@ from loopcal.measure.data_checks import check_types
 from loopcal.measure.instrument import make_random_stream
 from loopcal.measure.measurements import Measurements
 from loopcal.mechanism.model import Mechanism
-from loopcal.numerics.decomposition import (
-    NULL_COMPONENT,
-    are_nonzero,
-    find_null_space,
-    intersect_spaces,
-)
-from loopcal.numerics.statistics import (
-    compute_averaged_tail,
-    compute_chi_square_quantile,
-    compute_f_tail,
-    compute_single_level,
-)
+from loopcal.numerics import decomposition, statistics
 from loopcal.plain_text import represent
 from loopcal.results.description import Field, fields
 from loopcal.results.result import Result
@@ -225,7 +214,7 @@ class ParameterChanges:
         """Return the tail probability of chi-square if nothing changed; NaN without a direction."""
         if degrees == 0 or not np.isfinite(chi_square):
             return float("nan")
-        return compute_averaged_tail(chi_square, degrees, self.sources)
+        return statistics.compute_averaged_tail(chi_square, degrees, self.sources)
 
     def estimate_shifts(self) -> tuple[FloatArray, FloatArray]:
         """Return the change (p,) of each parameter and its standard deviation (p,) [SI], while all
@@ -243,16 +232,16 @@ class ParameterChanges:
         squares = ((((gain @ e.root) ** 2).sum(axis=1), e.degrees) for e in self.errors)
         degrees = combine_degrees(variance, squares)
         square = (gain @ self.value) ** 2 / np.where(is_open, 1.0, variance)
-        return np.where(is_open, np.nan, compute_f_tail(1.0, degrees, square))
+        return np.where(is_open, np.nan, statistics.compute_f_tail(1.0, degrees, square))
 
     def _invert(self) -> tuple[FloatArray, BoolArray]:
         """Return the matrix (p, k) that gives the shifts in spreads of values, and which
         parameters (p,) it does not determine.
         """
         u, s, vt = np.linalg.svd(self.slope * self.unit, full_matrices=False)
-        is_used = are_nonzero(s, INDEPENDENT)
+        is_used = decomposition.are_nonzero(s, INDEPENDENT)
         basis = vt[is_used].T
-        is_open = 1.0 - (basis**2).sum(axis=1) > NULL_COMPONENT
+        is_open = 1.0 - (basis**2).sum(axis=1) > decomposition.NULL_COMPONENT
         return (basis / s[is_used]) @ u[:, is_used].T, is_open
 
     def find_span(self, places: list[int]) -> FloatArray:
@@ -321,7 +310,9 @@ class ParameterChanges:
             squares = zip(shares, (error.degrees for error in self.errors), strict=True)
             left = combine_degrees(np.array(float(rank)), squares)
             statistic = ((u @ basis) ** 2).sum(axis=1) / (shares @ sizes)
-            smallest = np.minimum(smallest, weight * compute_f_tail(rank, left, statistic))
+            smallest = np.minimum(
+                smallest, weight * statistics.compute_f_tail(rank, left, statistic)
+            )
         return smallest
 
     def group_limbs(self) -> dict[str, list[int]]:
@@ -351,11 +342,13 @@ def compare_information(first: Posterior, second: Posterior) -> ParameterChanges
     scaled = [own * unit for own in rows]
     # neither determines these directions, each at its own linearization: the small angle between
     # the two would count as information
-    common = intersect_spaces(find_null_space(scaled[0]), find_null_space(scaled[1]))
+    common = decomposition.intersect_spaces(
+        decomposition.find_null_space(scaled[0]), decomposition.find_null_space(scaled[1])
+    )
     scaled = [own - (own @ common) @ common.T for own in scaled]
     stacked = np.vstack(scaled)
     u, s, _ = np.linalg.svd(stacked, full_matrices=True)
-    rank = int(are_nonzero(s, INDEPENDENT).sum()) if len(s) else 0
+    rank = int(decomposition.are_nonzero(s, INDEPENDENT).sum()) if len(s) else 0
     left = u[:, rank:].T
     count = len(scaled[0])
     slope, value = left[:, count:] @ scaled[1] / unit, left @ np.concatenate(values)
@@ -423,7 +416,7 @@ def explain_change(changes: ParameterChanges, level: float) -> ChangeCause:
         if best < 0 or p_values[best] < level or results[best][1] == 0:
             continue
         left, degrees = results[best]
-        near = left + float(compute_chi_square_quantile(1.0, DISTINGUISHED))
+        near = left + float(statistics.compute_chi_square_quantile(1.0, DISTINGUISHED))
         others = [
             causes[i][0]
             for i in sorted(tested, key=lambda i: results[i][0])
@@ -457,7 +450,7 @@ def judge_change(
 ) -> JudgedChange:
     """Test whether a machine has changed, one of a number of tests at `level` together."""
     p_value = changes.compute_probability()
-    moved = bool(p_value < compute_single_level(level, tests))
+    moved = bool(p_value < statistics.compute_single_level(level, tests))
     data: dict[str, Any] = {"chi_square": changes.chi_square, "degrees": float(changes.degrees)}
     too_small = 1.0 - changes.compute_p_value(changes.chi_square, changes.degrees)
     cause, shift, sd = ChangeCause("none"), np.zeros(0), np.zeros(0)

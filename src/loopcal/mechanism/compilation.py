@@ -14,16 +14,11 @@ from loopcal.engine import Group, Program, Slot, State
 from loopcal.errors import MechanismError, suggest_names
 from loopcal.findings import Finding, Quantity, report_finding
 from loopcal.findings.wording import name_count
+from loopcal.mechanism import kinematics
 from loopcal.mechanism.actuation import list_open_sums, stack_sum_rows
 from loopcal.mechanism.assembly import AXES, BASE, PLATFORM, Address, Assembly, AttachedStage, Limb
 from loopcal.mechanism.chains import find_carrying_actuators, join_stage_states, locate_stage_bases
 from loopcal.mechanism.inverse import close_with_free_actuators, inverse_trials
-from loopcal.mechanism.kinematics import (
-    compute_closure_sign,
-    compute_readings,
-    forward_trials,
-    solve_serial,
-)
 from loopcal.mechanism.limb_rows import linearize_state
 from loopcal.mechanism.mobility import (
     RANK,
@@ -63,8 +58,8 @@ def find_impossible_values(
         target = read_coordinates(robot.home_state.T, robot.controlled)
         state = inverse_trials(robot, values[None], target)
     else:  # at the readings of the nominal home, where nominal values displace nothing
-        q = compute_readings(robot, robot.parameters.nominal[None], robot.home_state)
-        state = forward_trials(robot, values[None], q)
+        q = kinematics.compute_readings(robot, robot.parameters.nominal[None], robot.home_state)
+        state = kinematics.forward_trials(robot, values[None], q)
     if is_closed(state.status).all():
         return ()
     table = robot.parameters
@@ -183,7 +178,7 @@ def _close_at_home(
     if robot.is_serial and not robot.controlled:
         e, _ = robot.slots(robot.values[None])
         joints = driven_values(robot.program, robot.home_state)
-        return replace(robot, home_state=solve_serial(robot, e, joints))
+        return replace(robot, home_state=kinematics.solve_serial(robot, e, joints))
     robot = replace(robot, home_state=_find_home(robot))
     mobility = _count_freedoms(assembly, program)
     if has_spare := _has_spare_drives(assembly, mobility):
@@ -462,7 +457,7 @@ def _find_home(robot: Mechanism) -> State:
             "joint centers, the lengths and `home:`"
         )
     if shared or has_spare:
-        return replace(state, closure_sign=compute_closure_sign(robot, values, state))
+        return replace(state, closure_sign=kinematics.compute_closure_sign(robot, values, state))
     return state
 
 
@@ -610,7 +605,7 @@ def _check_drives_of_pose(robot: Mechanism) -> None:
             raise MechanismError(f"`held:` names {held!r}, which is not an actuator{hint}")
     moving = find_carrying_actuators(robot)
     values = robot.values[None]
-    q = compute_readings(robot, values, home)
+    q = kinematics.compute_readings(robot, values, home)
     D = differentiate_pose(robot, values, q, home).readings[0, 0][:, moving]
     scaled = D * robot.twist_scale[:, None] / robot.drive_units[moving]
     freedoms = count_rank(scaled)

@@ -22,12 +22,7 @@ import numpy as np
 
 from loopcal import engine
 from loopcal.engine import BlockRows, Structure
-from loopcal.numerics.decomposition import (
-    NUISANCE_TOLERANCE,
-    NULL_COMPONENT,
-    certain_share,
-    empty_factor,
-)
+from loopcal.numerics import decomposition
 from loopcal.numerics.statistics import find_distinct
 from loopcal.numerics.trial_batch import TrialBatch
 from loopcal.typing import BoolArray, FloatArray, IntArray
@@ -463,7 +458,7 @@ class TreeElimination(TrialBatch):
 
 def eliminate_tree(factors: NodeFactors) -> tuple[TreeElimination, FloatArray]:
     """Eliminate all unknowns; return also the factor (a, p + 1, p + 1) of the rows left."""
-    tree, limit = factors.tree, certain_share(NUISANCE_TOLERANCE)
+    tree, limit = factors.tree, decomposition.certain_share(decomposition.NUISANCE_TOLERANCE)
     done = None
     if tree.structures:
         shape = factors.trials, len(tree.node), factors.parameters
@@ -497,7 +492,7 @@ def _eliminate_by_decompositions(factors: NodeFactors) -> tuple[TreeElimination,
     """Return `eliminate_tree` where rows may leave directions of the unknowns open."""
     tree, arrays = factors.tree, factors.arrays()
     length = _column_lengths(factors, arrays)
-    rest = empty_factor(factors.trials, factors.parameters)
+    rest = decomposition.empty_factor(factors.trials, factors.parameters)
     rank, explained = np.zeros(factors.trials, dtype=np.int64), np.zeros(factors.trials)
     solutions: list[NodeSolution] = []
     for i in reversed(range(len(tree.structures))):
@@ -566,7 +561,7 @@ def _remove_unobservable(
         if i not in tree.parents:
             share[:, structure.unknowns] = (node.unobservable**2).sum(axis=2)
     if not any(nodes[i].unobservable.any() for i in tree.parents):
-        return np.sqrt(share) > NULL_COMPONENT, values
+        return np.sqrt(share) > decomposition.NULL_COMPONENT, values
     values = values.copy()
     carried, clusters = _carry_inwards(tree, nodes, length)
     for c in clusters:
@@ -577,7 +572,7 @@ def _remove_unobservable(
         along = np.matmul(basis, np.matmul(basis.swapaxes(-1, -2), scaled))
         values[:, inside] = (scaled - along) / length[:, inside, None]
         share[:, inside] += (basis**2).sum(axis=-1)
-    return np.sqrt(share) > NULL_COMPONENT, values
+    return np.sqrt(share) > decomposition.NULL_COMPONENT, values
 
 
 def _carry_inwards(
@@ -719,7 +714,7 @@ def _eliminate(
     left, s, vt = np.linalg.svd(scaled_triangle)
     # columns have length one: the largest singular value is at least one, unless earlier
     # eliminations have left nothing but rounding
-    used = s > NUISANCE_TOLERANCE * np.maximum(s[..., :1], 1.0)
+    used = s > decomposition.NUISANCE_TOLERANCE * np.maximum(s[..., :1], 1.0)
     turned = np.matmul(left.swapaxes(-1, -2), right)
     root = np.divide(1.0, s, out=np.zeros_like(s), where=used)
     scaled = vt.swapaxes(-1, -2) * root[..., None, :] / length[..., None]

@@ -27,14 +27,7 @@ from loopcal.mechanism.chains import has_spare_drives
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import TILT, list_dimensions, read_coordinates
 from loopcal.mechanism.solutions import has_one_solution, inverse
-from loopcal.planning.constraints import (
-    ConstraintCheck,
-    ConstraintChecker,
-    Constraints,
-    Violation,
-    build_checker,
-    list_reasons,
-)
+from loopcal.planning import constraints
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension
 
@@ -92,8 +85,8 @@ def measure_distance(robot: Mechanism, start: FloatArray, end: FloatArray) -> Fl
 
 
 def check_paths(
-    checker: ConstraintChecker, start: FloatArray, end: FloatArray, steps: int = STEPS
-) -> ConstraintCheck:
+    checker: constraints.ConstraintChecker, start: FloatArray, end: FloatArray, steps: int = STEPS
+) -> constraints.ConstraintCheck:
     """Check straight paths from start (n, c) to end (n, c), both ends included, but for the line of
     sight.
 
@@ -129,18 +122,20 @@ def check_paths(
             if has_spare_drives(robot):  # the readings of an end depend on the way to it
                 continue
             difference = np.abs(solution.q - inverse(robot, end[left]).q) / scale
-            violations[left[~(difference <= BRANCH).all(axis=1)]] = Violation("branch-changed")
+            violations[left[~(difference <= BRANCH).all(axis=1)]] = constraints.Violation(
+                "branch-changed"
+            )
     allowed = np.array([violation is None for violation in violations], dtype=bool)
-    return ConstraintCheck(allowed, violations)
+    return constraints.ConstraintCheck(allowed, violations)
 
 
 def _check_at_once(
-    checker: ConstraintChecker, start: FloatArray, end: FloatArray, count: int
-) -> list[Violation | None]:
+    checker: constraints.ConstraintChecker, start: FloatArray, end: FloatArray, count: int
+) -> list[constraints.Violation | None]:
     """Return the first violations of n paths, all of whose steps are solved from home at once, of a
     machine whose poses have one set of readings each.
     """
-    share, first = np.arange(count + 1) / count, list[Violation | None]()
+    share, first = np.arange(count + 1) / count, list[constraints.Violation | None]()
     at_once = max(POSES_AT_ONCE // len(share), 1)
     for i in range(0, len(start), at_once):
         begin, goal = (
@@ -173,7 +168,7 @@ class VisitingOrder:
     is_converged: bool
 
 
-def order_poses(checker: ConstraintChecker, poses: FloatArray) -> VisitingOrder:
+def order_poses(checker: constraints.ConstraintChecker, poses: FloatArray) -> VisitingOrder:
     """Return a short order of poses (n, c) [m, rad] that straight paths connect with home."""
     robot, n = checker.robot, len(poses)
     home = np.broadcast_to(locate_home(robot), poses.shape)
@@ -260,12 +255,12 @@ def check_route(robot: Mechanism, labels: Sequence[str], coordinates: FloatArray
     """
     home = locate_home(robot)
     stops = np.vstack([home, coordinates, home])
-    checker = build_checker(robot, Constraints(min_margin=0.0))
+    checker = constraints.build_checker(robot, constraints.Constraints(min_margin=0.0))
     check = check_paths(checker, stops[:-1], stops[1:])
     if not check.allowed.all():
         i = int(np.flatnonzero(~check.allowed)[0])
         names = ("home", *labels, "home")
-        reasons = list_reasons(Counter([check.violations[i]]))
+        reasons = constraints.list_reasons(Counter([check.violations[i]]))
         raise MechanismError.of(
             "plan.route-blocked", first=names[i], last=names[i + 1], reasons=reasons
         )

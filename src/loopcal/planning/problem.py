@@ -20,23 +20,10 @@ from typing import ClassVar
 import numpy as np
 
 from loopcal.apply.accuracy import transport
-from loopcal.diagnose.error_frames import (
-    FITTED,
-    RELATIVE,
-    ErrorFrame,
-    ReferencePoses,
-    follow_pose,
-    refer_errors,
-    solve_home,
-)
+from loopcal.diagnose import error_frames
 from loopcal.errors import DataError, EstimationError
+from loopcal.estimate import information
 from loopcal.estimate.free_parameters import FreeParameters, select_free_parameters
-from loopcal.estimate.information import (
-    collect_information,
-    count_equations,
-    find_unfixed_motions,
-    observe_poses,
-)
 from loopcal.estimate.posterior import SAME_MOTION
 from loopcal.estimate.problem import problem_of
 from loopcal.findings import Finding, Quantity, report_finding
@@ -49,6 +36,7 @@ from loopcal.mechanism.solutions import Solution, inverse
 from loopcal.mechanism.workspace import sample_workspace
 from loopcal.numerics.decomposition import Decomposition, are_nonzero, intersect_spaces
 from loopcal.numerics.statistics import compute_weighted_quantile
+from loopcal.planning import pose_groups
 from loopcal.planning.candidates import Candidates, check_listed_poses, draw_candidates
 from loopcal.planning.constraints import N_POSES, Constraints, PlanOptions, Target
 from loopcal.planning.design_space import (
@@ -65,13 +53,6 @@ from loopcal.planning.design_space import (
     is_full_rank,
 )
 from loopcal.planning.exchange import Design, compute_design_curve, find_smallest_design
-from loopcal.planning.pose_groups import (
-    GroupRows,
-    combine_prior,
-    decompose_information,
-    find_group_motions,
-    linearize_candidate_groups,
-)
 from loopcal.results.description import Field, fields
 from loopcal.typing import FloatArray, IntArray, Progress, report_no_progress
 from loopcal.units import Dimension
@@ -99,7 +80,7 @@ class Prediction:
     rotations: FloatArray  # (k, 3, p) derivatives of its rotation [rad per spread]
     displacements: FloatArray  # (k, 3, p) derivatives of its displacement [m per spread]
     size: float  # makes rotations comparable with displacements [m]
-    frame: ErrorFrame  # in which errors are stated
+    frame: error_frames.ErrorFrame  # in which errors are stated
 
     def __len__(self) -> int:
         return len(self.displacements)
@@ -123,22 +104,24 @@ class Prediction:
 
 
 def linearize_prediction(
-    free: FreeParameters, solution: Solution, unfixed: FloatArray, frame: str = FITTED
+    free: FreeParameters, solution: Solution, unfixed: FloatArray, frame: str = error_frames.FITTED
 ) -> Prediction:
     """Return how the tool's pose depends on the parameters, in a frame of `PlanOptions`.
 
     solution : the poses to predict. unfixed : (12, k) motions of frames that the measurements will
         not determine; "fitted" is after the best rigid fit of them over the poses to predict.
     """
-    poses = observe_poses(free, solution.q)
+    poses = information.observe_poses(free, solution.q)
     T, twists = poses.T[0, poses.is_reached], poses.twists[0, poses.is_reached]
     followed = None
-    if frame == RELATIVE:
-        home = observe_poses(free, solve_home(free.robot).q)
+    if frame == error_frames.RELATIVE:
+        home = information.observe_poses(free, error_frames.solve_home(free.robot).q)
         own = np.zeros((6, 0))
-        followed = follow_pose(free.robot, home.T[0, 0], home.twists[0, 0], own, "home")
-    chosen = refer_errors(
-        free.robot, frame, ReferencePoses(T, twists, "predicted"), unfixed, followed
+        followed = error_frames.follow_pose(
+            free.robot, home.T[0, 0], home.twists[0, 0], own, "home"
+        )
+    chosen = error_frames.refer_errors(
+        free.robot, frame, error_frames.ReferencePoses(T, twists, "predicted"), unfixed, followed
     )
     if chosen.undetermined and free.assumed.any():
         missing = int(free.assumed.sum())
@@ -189,7 +172,7 @@ class PlanningProblem:
     instrument: Instrument  # mounted on its tool
     options: PlanOptions  # of the plan
     candidates: Candidates  # poses that may be measured
-    groups: GroupRows  # their rows
+    groups: pose_groups.GroupRows  # their rows
     prior: PriorInformation  # information before the first new pose
     observable: Decomposition  # decomposition of all candidates together, without spreads
     prediction: Prediction  # of the tool's pose over the workspace
@@ -326,8 +309,8 @@ def prepare_problem(
     elif candidates is None:
         candidates = draw_candidates(robot, options.constraints, options.n_candidates, rng)
     mounted, measured = instrument.with_tool(robot), options.measured
-    groups = linearize_candidate_groups(free, mounted, candidates.solution.q, rng)
-    observable = decompose_information(groups)
+    groups = pose_groups.linearize_candidate_groups(free, mounted, candidates.solution.q, rng)
+    observable = pose_groups.decompose_information(groups)
     if not observable.singular_values.max(initial=0.0) > NO_INFORMATION:
         raise EstimationError.of(
             "plan.nothing-observable",
@@ -338,12 +321,12 @@ def prepare_problem(
         )
     earlier, n_equations, labels = None, 0, ()
     to_predict = _select_predicted(candidates, options)
-    unfixed = find_group_motions(free, mounted, candidates.solution.q, groups.members)
+    unfixed = pose_groups.find_group_motions(free, mounted, candidates.solution.q, groups.members)
     if measured is not None:
         earlier, n_equations = _fold_measured(free, measured)
-        observable, labels = decompose_information(groups, earlier), measured.labels
+        observable, labels = pose_groups.decompose_information(groups, earlier), measured.labels
         problem, z = problem_of(free, measured), free.deviation(robot.values[None])
-        found = find_unfixed_motions(problem, z, problem.start(z))
+        found = information.find_unfixed_motions(problem, z, problem.start(z))
         still_open = unfixed[:, :0] if found is None else found.motions
         unfixed = intersect_spaces(unfixed, still_open, SAME_MOTION)
     return PlanningProblem(
@@ -352,7 +335,7 @@ def prepare_problem(
         options,
         candidates,
         groups,
-        combine_prior(free, groups, earlier),
+        pose_groups.combine_prior(free, groups, earlier),
         observable,
         linearize_prediction(free, to_predict, unfixed, options.frame),
         n_equations,
@@ -393,13 +376,13 @@ def _fold_measured(free: FreeParameters, measured: Measurements) -> tuple[FloatA
     check_actuators(measured, robot)
     if not any(rows.is_measured.any() for rows in measured.observations):
         raise DataError.of("plan.measured-empty")
-    factor, reached = collect_information(free, measured)
+    factor, reached = information.collect_information(free, measured)
     if not reached.all():
         label = measured.labels[int(np.flatnonzero(~reached)[0])]
         raise DataError.of("plan.measured-pose-unreachable", robot=robot.name, pose=label)
     table = measured.nuisance_parameters.table
     nuisance = int((table.free & np.isnan(table.tolerance)).sum())
-    n_equations = max(count_equations(robot, measured) - nuisance, 0)
+    n_equations = max(information.count_equations(robot, measured) - nuisance, 0)
     return factor[0, :-1, :-1], n_equations
 
 

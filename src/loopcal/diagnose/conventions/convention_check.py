@@ -46,13 +46,7 @@ from loopcal.diagnose.conventions.misfit import (
 from loopcal.errors import DataError
 from loopcal.estimate.free_parameters import FreeParameters, select_free_parameters
 from loopcal.findings import Finding, Severity, report_finding
-from loopcal.measure.data_checks import (
-    check_actuators,
-    check_targets_move,
-    check_types,
-    describe_outside_strokes,
-    has_static_targets,
-)
+from loopcal.measure import data_checks
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.nuisance import choose_setup_unit
 from loopcal.mechanism.model import Mechanism
@@ -132,13 +126,13 @@ def check_conventions(
     ------
     DataError : with the files of the data and the evidence; its code is that of the finding.
     """
-    check_types(robot, data)
+    data_checks.check_types(robot, data)
     try:
-        if not allow_still and has_static_targets(data):
+        if not allow_still and data_checks.has_static_targets(data):
             solution = forward(robot, data.readings)
             if solution.converged.any():
                 T = solution.T[solution.converged]
-                check_targets_move(data.take(solution.converged), T, robot.size)
+                data_checks.check_targets_move(data.take(solution.converged), T, robot.size)
         if allow_implausible:
             return ConventionCheck(float("nan"))
         check = compare_conventions(robot, data)
@@ -167,8 +161,8 @@ def compare_conventions(robot: Mechanism, data: Measurements) -> ConventionCheck
     ------
     DataError : the readings have another number of actuators.
     """
-    check_types(robot, data)
-    check_actuators(data, robot)
+    data_checks.check_types(robot, data)
+    data_checks.check_actuators(data, robot)
     data = replace(data, base_observations=())
     robot = fix_breaking_parameters(robot)  # no data contain other values of them
     free = select_free_parameters(robot)
@@ -433,7 +427,9 @@ def explain_outside_strokes(
 
     described : these readings, as of `describe_outside_strokes`; default: without places.
     """
-    described = describe_outside_strokes(data, robot) if described is None else described
+    described = (
+        data_checks.describe_outside_strokes(data, robot) if described is None else described
+    )
     if described is None:
         return None
     check = compare_conventions(robot, data)
@@ -443,7 +439,7 @@ def explain_outside_strokes(
     inside = [
         candidate
         for candidate in candidates
-        if describe_outside_strokes(candidate.apply(data), robot) is None
+        if data_checks.describe_outside_strokes(candidate.apply(data), robot) is None
     ]
     if not inside or not check.other_misfit <= ALLOWED:
         return None
