@@ -61,8 +61,10 @@ FAR, MOST_EXCLUDED = 5.0, 0.25
 # Number of poses that Newton's method does not reach from home at once, and that are tried along
 # a path before all others.
 FOLLOWED = 8
-# Factor by which open loops must close in another unit of the readings before they are refused.
-CLOSER = 20.0
+# Factor by which open loops must close in another unit of the readings before they are refused, and
+# share of the robot's size by which they must be open: smaller readings are closer to home, where
+# all loops close.
+CLOSER, WIDE_OPEN = 20.0, 0.1
 
 
 class Effort(NamedTuple):
@@ -297,7 +299,10 @@ def find_reading_unit(free: FreeParameters, data: Measurements) -> Finding | Non
     def measure_gap(read: Measurements) -> float:
         return float(np.median(forward(robot, read.readings).residual))
 
-    gap, units = measure_gap(few), list_reading_interpretations(few, robot.actuators)
+    gap = measure_gap(few)
+    if not gap > WIDE_OPEN * robot.size:
+        return None
+    units = list_reading_interpretations(few, robot.actuators)
     gaps = {u: measure_gap(u.apply(few)) for u in units if u.slip == "unit"}
     best = min(gaps, key=gaps.__getitem__)
     if not gaps[best] * CLOSER < gap:
