@@ -42,13 +42,7 @@ from loopcal.measure.measurements import Measurements
 from loopcal.mechanism.model import Mechanism
 from loopcal.planning import companion
 from loopcal.planning.constraints import restore_options
-from loopcal.results.tables import (
-    Column,
-    Table,
-    format_uncertainty,
-    format_with_uncertainty,
-    word_column,
-)
+from loopcal.results import tables
 from loopcal.units import Dimension, find_unit
 
 COMMANDS = {
@@ -287,9 +281,9 @@ class MeasuringSession:
             for values, sds in pairs.values():
                 value, sd = values[i] / factor, sds[i] / factor
                 is_known = np.isfinite(sd)
-                cells.append(format_with_uncertainty(value, sd) if is_known else "unknown")
-                cells.append(format_uncertainty(sd) if is_known else "")
+                cells.append(tables.format_with_uncertainty(value, sd) if is_known else "unknown")
+                cells.append(tables.format_uncertainty(sd) if is_known else "")
             rows.append(tuple(cells))
-        numbers = (Column(title) for name in pairs for title in (name, "sd"))
-        columns = (word_column("value"), word_column("unit"), *numbers)
-        self.say(Table("", columns, tuple(rows)), *verdict.findings)
+        numbers = (tables.Column(title) for name in pairs for title in (name, "sd"))
+        columns = (tables.word_column("value"), tables.word_column("unit"), *numbers)
+        self.say(tables.Table("", columns, tuple(rows)), *verdict.findings)

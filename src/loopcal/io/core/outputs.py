@@ -18,23 +18,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from loopcal.errors import FileError
+from loopcal.io.core import text_file
 from loopcal.io.core.limits import TABLE_SIZE
-from loopcal.io.core.text_file import (
-    convert_document,
-    create_temporary,
-    iterate_content,
-    list_leftovers,
-    place_folder,
-    read_json,
-    remove_leftovers,
-    report_write_errors,
-    resolve_links,
-    resolve_target,
-    restore_files,
-    sha256,
-    watch_folder,
-    write_bytes,
-)
 from loopcal.output_record import note_output
 
 FILES = "files"  # key of the list of files in the document of a result folder
@@ -58,7 +43,7 @@ def refuse_outputs(
     ]
     wanted = [path for path in outputs if path is not None]
     for i, path in enumerate(wanted):
-        folder = resolve_target(path).parent
+        folder = text_file.resolve_target(path).parent
         if any(_is_same_file(path, other) for other in read):
             raise FileError(
                 "this output is also an input of this command. Choose another name", path
@@ -72,7 +57,7 @@ def refuse_outputs(
         if path.is_file() and not force:
             raise FileError.of("files.output-exists", path)
         if not force:  # another command may take the name before this one has its result
-            note_output(path, resolve_target(path), None)
+            note_output(path, text_file.resolve_target(path), None)
         document = _read_document(path) if path.suffix == ".json" and path.is_file() else None
         if isinstance((document or {}).get(FILES), dict):  # that of a result folder
             raise FileError.of("files.output-in-result", path)
@@ -81,7 +66,9 @@ def refuse_outputs(
 @contextmanager
 def restore_on_failure(outputs: Sequence[Path | None]) -> Iterator[None]:
     """Restore or remove these files where the body fails; None is skipped."""
-    with restore_files([resolve_target(path) for path in outputs if path is not None]):
+    with text_file.restore_files(
+        [text_file.resolve_target(path) for path in outputs if path is not None]
+    ):
         yield
 
 
@@ -89,7 +76,9 @@ def write_files(files: Mapping[Path, str] | Mapping[Path, str | bytes]) -> None:
     """Write files (path -> content) whole, or none of them; FileError where that is impossible."""
     with restore_on_failure(tuple(files)):
         for path, content in files.items():
-            write_bytes(path, content.encode("utf-8") if isinstance(content, str) else content)
+            text_file.write_bytes(
+                path, content.encode("utf-8") if isinstance(content, str) else content
+            )
 
 
 def _is_same_file(path: Path, other: Path) -> bool:
@@ -114,14 +103,14 @@ def replace_folder(
     def is_left_of_us(left: Path) -> bool:
         return left.is_dir() and all(file.name in names for file in left.iterdir())
 
-    with report_write_errors(path):
-        target = resolve_links(path)
+    with text_file.report_write_errors(path):
+        target = text_file.resolve_links(path)
         if names:
-            remove_leftovers(target, is_left_of_us)
+            text_file.remove_leftovers(target, is_left_of_us)
         target.parent.mkdir(parents=True, exist_ok=True)
-        with create_temporary(target, is_folder=True) as temporary:
+        with text_file.create_temporary(target, is_folder=True) as temporary:
             yield temporary
-            place_folder(temporary, target, path, check)
+            text_file.place_folder(temporary, target, path, check)
 
 
 _BLANK = "0" * 64  # stands for the document's own digest where this is computed
@@ -147,10 +136,10 @@ def refuse_folder(path: Path, kind: FolderKind, force: bool, inputs: Sequence[Pa
     in use (without `force`), or protected; or it contains an input of the command, or anything but
     an unchanged result of this kind.
     """
-    target = resolve_links(path)
-    with report_write_errors(path):
+    target = text_file.resolve_links(path)
+    with text_file.report_write_errors(path):
         # what killed commands left beside a folder; one that was set aside is renamed back
-        remove_leftovers(target, lambda folder: _is_own(folder, kind))
+        text_file.remove_leftovers(target, lambda folder: _is_own(folder, kind))
         if target.exists() and not target.is_dir():
             sentence = f"this is a file, but the {kind.content} is a folder. Choose another name"
             raise FileError(sentence, path)
@@ -181,7 +170,7 @@ def refuse_folder(path: Path, kind: FolderKind, force: bool, inputs: Sequence[Pa
 def _refuse_other_content(path: Path, kind: FolderKind) -> None:
     """Raise FileError where a folder is not an unchanged result of this kind, and nothing else."""
     while path.is_dir():
-        with watch_folder(path.resolve()) as is_same:
+        with text_file.watch_folder(path.resolve()) as is_same:
             try:
                 document = _read_document(path / kind.document) or {}
                 listed = _list_digests(document)
@@ -224,7 +213,7 @@ def write_result_folder(
     cannot be written.
     """
     digests = dict.fromkeys((*sorted(files), kind.document), _BLANK)
-    computed = convert_document({**document, FILES: digests})
+    computed = text_file.convert_document({**document, FILES: digests})
 
     refuse_folder(path, kind, force)
     with replace_folder(path, lambda old: refuse_folder(old, kind, force)) as folder:
@@ -235,18 +224,20 @@ def write_result_folder(
                 file.write_bytes(content)
             else:
                 content(file)
-        written = digests | {name: sha256(folder / name) for name in files}
+        written = digests | {name: text_file.sha256(folder / name) for name in files}
         digest = hashlib.sha256()
-        for part in iterate_content({**computed, FILES: written}):
+        for part in text_file.iterate_content({**computed, FILES: written}):
             digest.update(part.encode())
         written[kind.document] = digest.hexdigest()
         with (folder / kind.document).open("wb") as stream:
-            stream.writelines(map(str.encode, iterate_content({**computed, FILES: written})))
+            stream.writelines(
+                map(str.encode, text_file.iterate_content({**computed, FILES: written}))
+            )
 
 
 def describe_leftover(path: Path, document: str) -> str:
     """Return a sentence on a folder that a killed command set aside; empty where there is none."""
-    for folder in list_leftovers(resolve_links(path)):
+    for folder in text_file.list_leftovers(text_file.resolve_links(path)):
         if (folder / document).is_file():
             return f"an interrupted command left it as {folder}. Rename this folder"
     return ""
@@ -285,7 +276,7 @@ def _is_changed(path: Path, name: str, kind: FolderKind, listed: Mapping[str, st
     if (path / name).is_dir():
         return False
     if name != kind.document:
-        return sha256(path / name) != listed[name]
+        return text_file.sha256(path / name) != listed[name]
     digest = _quote(kind, listed[name]).encode()
     content = (path / name).read_bytes().replace(digest, _quote(kind, _BLANK).encode())
     return hashlib.sha256(content).hexdigest() != listed[name]
@@ -308,7 +299,7 @@ def _list_entries(path: Path, prefix: str = "") -> Iterator[str]:
 def _read_document(path: Path) -> dict[str, Any] | None:
     """Return the document of a folder; None where it is missing or damaged."""
     try:
-        content = read_json(path, "result", "repeat the command", TABLE_SIZE)
+        content = text_file.read_json(path, "result", "repeat the command", TABLE_SIZE)
     except FileError:
         return None
     return content if isinstance(content, dict) else None

@@ -18,18 +18,7 @@ import numpy as np
 from loopcal.errors import MechanismError
 from loopcal.geometry import stack_matrix
 from loopcal.mechanism.assembly import Actuator, Address, Assembly, Joint, LinearMap, SharedMap
-from loopcal.mechanism.families.placement import (
-    EZ,
-    AngleTolerance,
-    ErrorModel,
-    JointPlacement,
-    LengthTolerance,
-    PlacedLimb,
-    place_limb,
-    single_error,
-    standard_deviation,
-    translate,
-)
+from loopcal.mechanism.families import placement
 from loopcal.mechanism.families.records import RobotRecord, values_per_leg
 from loopcal.parameters import Parameter
 from loopcal.typing import FloatArray
@@ -40,10 +29,10 @@ from loopcal.units import Angle, Dimension, Length
 class DeltaTolerances:
     """Expected spreads of the delta's parameters."""
 
-    radius: LengthTolerance | None = None
-    angles: AngleTolerance | None = None
-    arms: LengthTolerance | None = None
-    stops: LengthTolerance | None = None
+    radius: placement.LengthTolerance | None = None
+    angles: placement.AngleTolerance | None = None
+    arms: placement.LengthTolerance | None = None
+    stops: placement.LengthTolerance | None = None
 
 
 @dataclass(frozen=True)
@@ -113,19 +102,21 @@ class LinearDelta(RobotRecord):
                 f"{min(arms) * 1e3:g} mm; the radius must be positive and every arm longer than it"
             )
         sd = {
-            name: standard_deviation(getattr(self.tolerances, name), f"the {name}")
+            name: placement.standard_deviation(getattr(self.tolerances, name), f"the {name}")
             for name in ("radius", "angles", "arms", "stops")
         }
-        errors = single_error("radius", Dimension.LENGTH, self.radius, sd["radius"], positive=True)
-        limbs, own = list[PlacedLimb](), list[Actuator]()
+        errors = placement.single_error(
+            "radius", Dimension.LENGTH, self.radius, sd["radius"], positive=True
+        )
+        limbs, own = list[placement.PlacedLimb](), list[Actuator]()
         for k, (angle, arm, stop) in enumerate(zip(self.angles, arms, stops, strict=True), start=1):
             limb, motor = f"arm{k}", f"q{k}"
             # above the nozzle: the other side is the mirrored working mode
             rise = float(np.sqrt(arm**2 - self.radius**2))
             carriage = Joint("carriage", "P", motor, start=self.home.z + rise)
-            foot = translate(self.radius * np.cos(angle), self.radius * np.sin(angle))
-            steps = (JointPlacement(carriage, foot, EZ),)
-            limbs.append(place_limb(limb, steps, np.eye(4), "distance", np.eye(4), arm))
+            foot = placement.translate(self.radius * np.cos(angle), self.radius * np.sin(angle))
+            steps = (placement.JointPlacement(carriage, foot, placement.EZ),)
+            limbs.append(placement.place_limb(limb, steps, np.eye(4), "distance", np.eye(4), arm))
             terms = {"offset": stop + rise, "gain": -1.0 if self.readings == "drop" else 1.0}
             own.append(Actuator(motor, Dimension.LENGTH, self.stroke, terms))
             names = (f"tower{k}.angle", f"arm{k}.length", f"tower{k}.stop")
@@ -137,6 +128,6 @@ class LinearDelta(RobotRecord):
             rod = LinearMap(names[1], Address(limb, "rod", "length"))
             x, y = (Address(limb, "carriage", axis) for axis in "xy")
             tower = TowerMap(("radius", *names), (x, y, Address(motor, "transmission", "offset")))
-            errors += ErrorModel(parameters, (rod,), (tower,))
+            errors += placement.ErrorModel(parameters, (rod,), (tower,))
         axes = ("x", "y", "z")
         return self.assemble(limbs, errors, freedoms=axes, controlled=axes, own=own)

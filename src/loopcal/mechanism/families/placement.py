@@ -14,18 +14,7 @@ import numpy as np
 
 from loopcal import geometry
 from loopcal.errors import MechanismError
-from loopcal.mechanism.assembly import (
-    AXES,
-    BASE,
-    PLATFORM,
-    Address,
-    Cone,
-    Joint,
-    Limb,
-    LinearMap,
-    Link,
-    SharedMap,
-)
+from loopcal.mechanism import assembly
 from loopcal.parameters import Parameter
 from loopcal.typing import FloatArray
 from loopcal.units import SD_RANGE, Angle, Dimension, Given, Length, is_sd
@@ -52,7 +41,7 @@ class JointPlacement:
     axis : (3,) in the placed frame, of any length but zero.
     """
 
-    joint: Joint
+    joint: assembly.Joint
     place: FloatArray
     axis: FloatArray
 
@@ -65,7 +54,7 @@ class PlacedLimb(NamedTuple):
     stem : name without the number of a copy.
     """
 
-    limb: Limb
+    limb: assembly.Limb
     rotations: Mapping[str, FloatArray]
     placements: Mapping[str, FloatArray]
     stem: str
@@ -100,8 +89,8 @@ def place_limb(
     attachment: FloatArray,
     length: float = 0.0,
     actuator: str | None = None,
-    cones: tuple[Cone, ...] = (),
-    bodies: tuple[str, str] = (BASE, PLATFORM),
+    cones: tuple[assembly.Cone, ...] = (),
+    bodies: tuple[str, str] = (assembly.BASE, assembly.PLATFORM),
 ) -> PlacedLimb:
     """Return a limb of its joints from one body to its tip, its tip and its attachment to another.
 
@@ -112,15 +101,15 @@ def place_limb(
     back, links, rotations, placements = np.eye(4), [], {}, {}
     for step in steps:
         link, turn = step.joint.name, frame_from_axis(step.axis, f"joint {step.joint.name!r}")
-        links.append(Link(link, back @ step.place @ rotation_matrix(turn)))
+        links.append(assembly.Link(link, back @ step.place @ rotation_matrix(turn)))
         rotations[link], placements[link] = turn, step.place
         back = rotation_matrix(turn.T)
-    last, end = "tip" if steps else bodies[0], Link(bodies[1], attachment)
-    links.append(Link(last, back @ tip))
+    last, end = "tip" if steps else bodies[0], assembly.Link(bodies[1], attachment)
+    links.append(assembly.Link(last, back @ tip))
     rotations |= {last: np.eye(3), end.name: np.eye(3)}
     placements |= {last: tip, end.name: attachment}
     joints = tuple(step.joint for step in steps)
-    limb = Limb(name, tuple(links), joints, ending, end, length, actuator, cones)
+    limb = assembly.Limb(name, tuple(links), joints, ending, end, length, actuator, cones)
     return PlacedLimb(limb, rotations, placements, strip_number(name))
 
 
@@ -144,9 +133,9 @@ def place_limb_with_ball(
     if axes is None:
         return place_limb(name, steps, translate(*center), "ball", attachment)
     ball = (
-        JointPlacement(Joint("ball1", "R"), geometry.make_pose(axes, center), EZ),
-        JointPlacement(Joint("ball2", "R"), np.eye(4), EY),
-        JointPlacement(Joint("ball3", "R"), np.eye(4), EX),
+        JointPlacement(assembly.Joint("ball1", "R"), geometry.make_pose(axes, center), EZ),
+        JointPlacement(assembly.Joint("ball2", "R"), np.eye(4), EY),
+        JointPlacement(assembly.Joint("ball3", "R"), np.eye(4), EX),
     )
     return place_limb(name, (*steps, *ball), np.eye(4), "rigid", attachment)
 
@@ -166,21 +155,21 @@ def frame_from_axis(axis: FloatArray, owner: str) -> FloatArray:
 
 def map_displacement(
     parameter: str, limb: PlacedLimb, element: str, axis: str, coefficient: float = 1.0
-) -> tuple[LinearMap, ...]:
+) -> tuple[assembly.LinearMap, ...]:
     """Map a parameter onto a translation along, or rotation about, an axis of the carried frame."""
-    direction = coefficient * np.eye(3)[AXES.index(axis) % 3]
-    return map_direction(parameter, limb, element, direction, turns=axis in AXES[:3])
+    direction = coefficient * np.eye(3)[assembly.AXES.index(axis) % 3]
+    return map_direction(parameter, limb, element, direction, turns=axis in assembly.AXES[:3])
 
 
 def map_direction(
     parameter: str, limb: PlacedLimb, element: str, direction: FloatArray, *, turns: bool
-) -> tuple[LinearMap, ...]:
+) -> tuple[assembly.LinearMap, ...]:
     """Map a parameter onto a turn about (or shift along) `direction` (3,) of a carried frame."""
     components = limb.rotations[element].T @ direction
-    axes = AXES[:3] if turns else AXES[3:]
+    axes = assembly.AXES[:3] if turns else assembly.AXES[3:]
     # what is below rounding of a direction is no component
     return tuple(
-        LinearMap(parameter, Address(limb.name, element, axis), float(part))
+        assembly.LinearMap(parameter, assembly.Address(limb.name, element, axis), float(part))
         for axis, part in zip(axes, components, strict=True)
         if abs(part) > 1e-12 * np.abs(components).max()
     )
@@ -188,7 +177,7 @@ def map_direction(
 
 def map_slide_tilt(
     parameter: str, limb: PlacedLimb, element: str, axis: str
-) -> tuple[LinearMap, ...]:
+) -> tuple[assembly.LinearMap, ...]:
     """Map a parameter onto the tilt of a slide's axis that does not rotate what slides on it.
 
     exp(w) A_j [slide] A_j^-1 P A_k exp(w') keeps the orientation P A_k if w' = -(P A_k)' w. The
@@ -201,7 +190,7 @@ def map_slide_tilt(
             f"{parameter} tilts {element!r} of {limb.name!r} alone, which only a slide allows. "
             "Leave out `alone: true`"
         )
-    w, after = np.eye(3)[AXES.index(axis)], names[place + 1]
+    w, after = np.eye(3)[assembly.AXES.index(axis)], names[place + 1]
     behind = limb.placements[after]
     maps = map_displacement(parameter, limb, element, axis)
     maps += map_direction(parameter, limb, after, -behind[:3, :3].T @ w, turns=True)
@@ -237,8 +226,8 @@ class ErrorModel:
     """Parameters with their maps; `+` joins two."""
 
     parameters: tuple[Parameter, ...] = ()
-    maps: tuple[LinearMap, ...] = ()
-    shared: tuple[SharedMap, ...] = ()
+    maps: tuple[assembly.LinearMap, ...] = ()
+    shared: tuple[assembly.SharedMap, ...] = ()
 
     def __add__(self, other: ErrorModel) -> ErrorModel:
         return join_errors((self, other))
@@ -288,7 +277,7 @@ def single_error(
     dimension: Dimension,
     nominal: float,
     tolerance: float | None,
-    *maps: LinearMap,
+    *maps: assembly.LinearMap,
     positive: bool = False,
 ) -> ErrorModel:
     """Return an error model of one named parameter; `positive` says that only values above zero
@@ -311,7 +300,7 @@ def displacement_error(
     value of a translation is that of the placement of the link.
     """
     maps, place = map_displacement(name, limb, element, axis), limb.placements[element]
-    at = np.concatenate([np.zeros(3), place[:3, :3].T @ place[:3, 3]])[AXES.index(axis)]
+    at = np.concatenate([np.zeros(3), place[:3, :3].T @ place[:3, 3]])[assembly.AXES.index(axis)]
     dimension = get_axis_dimension(axis)
     return single_error(name, dimension, at, tolerance, *maps, positive=positive)
 
@@ -327,7 +316,7 @@ def point_errors(
 
 def rod_length_error(limb: PlacedLimb, name: str, tolerance: float | None) -> ErrorModel:
     """Return the length of the rod of a `distance` ending at reading zero as a parameter."""
-    rod = LinearMap(name, Address(limb.name, "rod", "length"))
+    rod = assembly.LinearMap(name, assembly.Address(limb.name, "rod", "length"))
     length = limb.limb.length
     return single_error(name, Dimension.LENGTH, length, tolerance, rod, positive=True)
 
@@ -341,7 +330,7 @@ def offset_error(
     positive: bool = False,
 ) -> ErrorModel:
     """Return the value of a driven joint at reading zero as a parameter."""
-    offset = LinearMap(name, Address(actuator, "transmission", "offset"))
+    offset = assembly.LinearMap(name, assembly.Address(actuator, "transmission", "offset"))
     return single_error(name, dimension, nominal, tolerance, offset, positive=positive)
 
 
@@ -355,12 +344,12 @@ def complete_limbs(limbs: Sequence[PlacedLimb], spread: LinkTolerances) -> Error
         is_rigid = own.ending == "rigid"
         chosen = [(joint.name, KEPT_AXES[joint.kind]) for joint in own.joints]
         if not is_rigid:
-            chosen.append((own.links[-1].name, AXES[3:]))
-        if own.to == PLATFORM or places.get(own.to) != name:
-            chosen.append((own.attachment.name, AXES if is_rigid else AXES[3:]))
+            chosen.append((own.links[-1].name, assembly.AXES[3:]))
+        if own.to == assembly.PLATFORM or places.get(own.to) != name:
+            chosen.append((own.attachment.name, assembly.AXES if is_rigid else assembly.AXES[3:]))
         for element, axis in ((element, axis) for element, axes in chosen for axis in axes):
             parameter, dimension = f"{name}.{element}.{axis}", get_axis_dimension(axis)
-            entry = LinearMap(parameter, Address(name, element, axis))
+            entry = assembly.LinearMap(parameter, assembly.Address(name, element, axis))
             errors.append(single_error(parameter, dimension, 0.0, spread.select(dimension), entry))
         if own.ending == "distance" and not own.actuator:
             sd = spread.select(Dimension.LENGTH)
@@ -370,7 +359,7 @@ def complete_limbs(limbs: Sequence[PlacedLimb], spread: LinkTolerances) -> Error
 
 def get_axis_dimension(axis: str) -> Dimension:
     """Return the dimension of a displacement along or about one of AXES."""
-    return Dimension.ANGLE if axis in AXES[:3] else Dimension.LENGTH
+    return Dimension.ANGLE if axis in assembly.AXES[:3] else Dimension.LENGTH
 
 
 Point = tuple[Length, Length, Length]
