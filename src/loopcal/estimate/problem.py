@@ -322,21 +322,28 @@ class Problem:
         are_shared = poses.is_kept and poses.coordinates.are_shared
         if are_shared and t > 1 and (deviation == deviation[0]).all():
             known = poses.solve_exact_poses(deviation[:1], start, not folds)
+        # the elimination tells whether nuisance parameters are the best ones, and its step leads to
+        # those: mostly, the search for them is not needed
+        is_plain = t == 1 and poses.is_kept and not poses.coordinates.count
+        tries = 3 if is_plain and self.nuisance is not None and self.consistent is None else 0
         batch, linearizations = self.part_size, []
         for first in range(0, t, batch):
             chosen = np.arange(first, min(first + batch, t))
             z, trials, begin = deviation[chosen], self.trials[chosen], start.take(chosen)
-            # start values that were sought here may be the best ones, as the elimination tells
-            is_here = t == 1 and not poses.coordinates.count and (z == begin.deviation).all()
-            fixed = begin.nuisance if self.nuisance is not None and is_here else None
-            given, more = (z, trials, begin, self.control), {"derivatives": not folds}
-            solution = poses.solve(*given, fixed, known, **more)
-            part = self.take(chosen).linearize_at(z, begin, solution)
-            if fixed is not None and part.nuisance is not None:
+            solution, fixed = known, begin.predict_nuisance(z) if tries else None
+            before = np.full(1, np.inf)
+            while True:
+                at = z, trials, begin, self.control, fixed, solution
+                solution = poses.solve(*at, derivatives=not folds)
+                part = self.take(chosen).linearize_at(z, begin, solution)
+                if fixed is None or part.nuisance is None:
+                    break
                 gain = part.nuisance.elimination.explained
-                if not self.control.is_negligible(gain, part.cost + gain).all():
-                    solution = poses.solve(*given, None, solution, **more)
-                    part = self.take(chosen).linearize_at(z, begin, solution)
+                cost, tries = part.cost + gain, tries - 1
+                if np.isfinite(cost).all() and self.control.is_negligible(gain, cost).all():
+                    break
+                is_over = not tries or self.control.is_worse(cost, before).any()
+                fixed, before = None if is_over else part.nuisance.best, cost
             linearizations.append(part)
         return Linearization.join(linearizations)
 
