@@ -20,10 +20,12 @@ WELDED = """\
 <mujoco><compiler angle="radian"/><worldbody>
 <body name="crank" pos="0 0 0"><joint name="m" axis="0 0 1"/>
 <body name="rod" pos="0.1 0.1 0"><joint name="p" axis="0 0 1"/>
-<body name="tool" pos="0.2 0.05 0.01"/><body name="end" pos="0.4 0 0" euler="0 0 0.3"/></body></body>
+<body name="tool" pos="0.2 0.05 0.01"/><body name="end" pos="0.4 0 0" euler="0 0 0.3"/></body>
+</body>
 <body name="rocker" pos="0.5 -0.1 0"><joint name="r" axis="0 0 1"/>
 <body name="head" pos="0 0.2 0"><joint name="s" axis="0 0 1"/>
-<body name="pin" euler="0 0 0.3"/></body></body>
+<body name="pin" euler="0 0 0.3"/></body>
+</body>
 </worldbody><equality><weld body1="end" body2="pin"/></equality>
 <actuator><motor joint="m"/></actuator></mujoco>
 """
