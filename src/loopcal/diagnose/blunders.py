@@ -18,12 +18,7 @@ import numpy as np
 
 from loopcal import engine
 from loopcal.diagnose import outliers
-from loopcal.diagnose.conventions.interpretations import (
-    FACTORS,
-    list_orders,
-    permute_columns,
-    with_measured,
-)
+from loopcal.diagnose.conventions import interpretations
 from loopcal.errors import LoopcalError
 from loopcal.estimate.elimination import NodeRows, fold_node_rows
 from loopcal.estimate.fit_descent import estimate_scale_of
@@ -462,9 +457,11 @@ def _permute_targets(data: Measurements) -> Iterator[Reading]:
         names, columns = list(rows.kind.target_columns), list(rows.kind.target_columns.values())
         if len(names) < 2 or not len(rows) or len({len(places) for places in columns}) > 1:
             continue
-        for order in list_orders(len(names)):
+        for order in interpretations.list_orders(len(names)):
             sources = [column for source in order for column in columns[source]]
-            change = permute_columns([column for places in columns for column in places], sources)
+            change = interpretations.permute_columns(
+                [column for places in columns for column in places], sources
+            )
             moved = [j for j, source in enumerate(order) if j != source]
             pairs = [{"target": names[j], "holds": names[order[j]]} for j in moved]
             yield {"pairs": pairs}, _with_measured(data, i, change(rows.measured))
@@ -499,7 +496,7 @@ def _convert_units(check: HeldOutCheck, data: Measurements) -> Iterator[Reading]
     Where zeros fit as well, the expected values are within the noise and say nothing of a unit.
     """
     for i, rows in enumerate(data.observations):
-        for dimension, factors in FACTORS.items():
+        for dimension, factors in interpretations.FACTORS.items():
             columns = [c.dimension is dimension for c in rows.kind.columns]
             if not any(columns) or not len(rows):
                 continue
@@ -538,4 +535,4 @@ def _with_measured(data: Measurements, i: int, measured: FloatArray) -> Measurem
     measured = np.array(measured)
     kind = data.observations[i].kind
     measured[[row for row, _ in kind.find_invalid_rows(measured)]] = np.nan
-    return with_measured(data, i, measured)
+    return interpretations.with_measured(data, i, measured)

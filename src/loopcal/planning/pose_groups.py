@@ -39,12 +39,7 @@ from loopcal.mechanism.kinematics import forward_trials
 from loopcal.numerics.decomposition import Decomposition, decompose, empty_factor
 from loopcal.numerics.elimination import eliminate_columns, eliminate_from_factor
 from loopcal.numerics.statistics import choose_evenly
-from loopcal.planning.design_space import (
-    PriorInformation,
-    divide_by_factor,
-    factor_rows,
-    is_allowed,
-)
+from loopcal.planning import design_space
 from loopcal.typing import FloatArray, IntArray
 
 BLOCK = 256  # groups whose rows are computed at once
@@ -77,7 +72,7 @@ class GroupRows:
         the machine and the nuisance parameters eliminated, and the number of its rows.
         """
         width = self.rows.shape[2]
-        allowed = self.rows[is_allowed(self.rows)].reshape(-1, width)
+        allowed = self.rows[design_space.is_allowed(self.rows)].reshape(-1, width)
         flat = np.concatenate([allowed, self.nuisance_prior])
         factor = engine.fold(empty_factor(1, width), with_zeros(flat))
         return eliminate_from_factor(factor, self.n_nuisance), len(flat)
@@ -178,7 +173,7 @@ def linearize_groups(
 
 def combine_prior(
     free: FreeParameters, groups: GroupRows, measured: FloatArray | None = None
-) -> PriorInformation:
+) -> design_space.PriorInformation:
     """Return the information before the first new pose: stated spreads of the robot and of the
     instrument, and earlier measurements.
 
@@ -187,7 +182,9 @@ def combine_prior(
     """
     o = groups.n_nuisance
     rows = free.prior_rows()
-    stated = PriorInformation(np.concatenate([np.zeros((len(rows), o)), rows], axis=1), o)
+    stated = design_space.PriorInformation(
+        np.concatenate([np.zeros((len(rows), o)), rows], axis=1), o
+    )
     prior = stated.with_rows(groups.nuisance_prior)
     if measured is None:
         return prior
@@ -213,7 +210,7 @@ def find_group_motions(
     """
     some = members[choose_evenly(len(members), ENOUGH)]
     groups = linearize_groups(free, instrument, readings, some, True)
-    of_frames = groups.rows[is_allowed(groups.rows)][:, :, groups.n_nuisance :]
+    of_frames = groups.rows[design_space.is_allowed(groups.rows)][:, :, groups.n_nuisance :]
     return unfixed_motions(groups.fold()[0], float(np.linalg.norm(of_frames)))
 
 
@@ -366,11 +363,11 @@ def add_informative_groups(
     rows : (N, r, c) of groups, whitened and in spreads; NaN where not allowed.
     members : (N, k) their poses.
     """
-    good, k, c = is_allowed(rows), members.shape[1], rows.shape[2]
+    good, k, c = design_space.is_allowed(rows), members.shape[1], rows.shape[2]
     if not good.any():
         return members[:0]
-    R = factor_rows(np.concatenate([np.eye(c), rows[good].reshape(-1, c)]))
-    slopes = (divide_by_factor(rows[good], R) ** 2).sum(axis=(1, 2))
+    R = design_space.factor_rows(np.concatenate([np.eye(c), rows[good].reshape(-1, c)]))
+    slopes = (design_space.divide_by_factor(rows[good], R) ** 2).sum(axis=(1, 2))
     best = np.zeros(poses)
     np.maximum.at(best, members[good].ravel(), np.repeat(slopes, k))
     count = k

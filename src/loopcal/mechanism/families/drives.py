@@ -18,21 +18,7 @@ import numpy as np
 from loopcal import geometry
 from loopcal.errors import suggest_names
 from loopcal.mechanism.assembly import AXES, FORCES, Actuator, Address, Joint, Limb, LinearMap, Load
-from loopcal.mechanism.families.placement import (
-    AngleTolerance,
-    ErrorModel,
-    LengthTolerance,
-    LinkTolerances,
-    PlacedLimb,
-    Point,
-    RatioTolerance,
-    RecordError,
-    ToleranceRecord,
-    join_errors,
-    single_error,
-    standard_deviation,
-    strip_number,
-)
+from loopcal.mechanism.families import placement
 from loopcal.mechanism.transmission import (
     HARMONICS,
     LOAD,
@@ -66,12 +52,12 @@ class RowRecord:
     WORD: ClassVar[str] = "actuator"
 
     @classmethod
-    def refuse(cls, name: str, sentence: str) -> RecordError:
+    def refuse(cls, name: str, sentence: str) -> placement.RecordError:
         """Return the error of an impossible one; the sentence begins behind its name."""
-        return RecordError(f"{cls.WORD} {name!r} {sentence}", cls.SECTION, name)
+        return placement.RecordError(f"{cls.WORD} {name!r} {sentence}", cls.SECTION, name)
 
 
-class StrokeError(RecordError):
+class StrokeError(placement.RecordError):
     """Strokes of triangle drives with lengths of no angle; `strokes` has their sentences."""
 
     def __init__(self, strokes: Mapping[str, str]) -> None:
@@ -97,8 +83,8 @@ class Triangle:
     foot : on what carries the joint. head : on what the joint turns, with the joint at zero.
     """
 
-    foot: Point
-    head: Point
+    foot: placement.Point
+    head: placement.Point
     skew: Skew = field(default_factory=Skew)
 
 
@@ -138,8 +124,8 @@ class DriveRecord(RowRecord):
 class GivesLength(DriveRecord):
     """The expected spreads of a drive that gives a length."""
 
-    length: LengthTolerance | None = None
-    compliances: LengthTolerance | None = None
+    length: placement.LengthTolerance | None = None
+    compliances: placement.LengthTolerance | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -147,7 +133,7 @@ class Gain:
     """The scale of a drive whose reading has the unit of its joint, with its spread `ratio`."""
 
     gain: Ratio = 1.0
-    ratio: RatioTolerance | None = None
+    ratio: placement.RatioTolerance | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -158,7 +144,7 @@ class Sum:
     """
 
     sum: Mapping[str, Ratio] = field(default_factory=dict)
-    weights: RatioTolerance | None = None
+    weights: placement.RatioTolerance | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -168,7 +154,7 @@ class Radii:
     """
 
     radius: Mapping[str, Length] = field(default_factory=dict)
-    radii: LengthTolerance | None = None
+    radii: placement.LengthTolerance | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -186,8 +172,8 @@ class AngleDrive(Sum, Gain, DriveRecord):
     GIVEN: ClassVar[Dimension] = Dimension.ANGLE
 
     reads: Literal["angle"]
-    angle: AngleTolerance | None = None
-    compliances: AngleTolerance | None = None
+    angle: placement.AngleTolerance | None = None
+    compliances: placement.AngleTolerance | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -204,8 +190,8 @@ class SpoolDrive(Sum, GivesLength):
     reads: Literal["angle"]
     radius: Length
     buildup: Length = 0.0
-    radii: LengthTolerance | None = None
-    buildups: LengthTolerance | None = None
+    radii: placement.LengthTolerance | None = None
+    buildups: placement.LengthTolerance | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -216,7 +202,7 @@ class ScrewDrive(Radii, Sum, GivesLength):
 
     reads: Literal["angle"]
     lead: Length
-    leads: LengthTolerance | None = None
+    leads: placement.LengthTolerance | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -229,7 +215,7 @@ class TriangleDrive(Gain, GivesLength):
 
     reads: Literal["length"] = "length"
     triangle: Triangle
-    angle: AngleTolerance | None = None
+    angle: placement.AngleTolerance | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -259,7 +245,7 @@ class LoadFrame:
     """
 
     axes: Literal["base", "platform"] = "base"
-    at: Point = (0.0, 0.0, 0.0)
+    at: placement.Point = (0.0, 0.0, 0.0)
 
     def place(self, stated: Mapping[str, Condition]) -> Load:
         """Return the load of stated conditions."""
@@ -292,8 +278,8 @@ class AngleCoupling(CouplingRecord):
     GIVEN: ClassVar[Dimension] = Dimension.ANGLE
 
     of: Literal["angle"] = "angle"
-    angle: AngleTolerance | None = None
-    slopes: AngleTolerance | None = None
+    angle: placement.AngleTolerance | None = None
+    slopes: placement.AngleTolerance | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -303,8 +289,8 @@ class LengthCoupling(Radii, CouplingRecord):
     """
 
     of: Literal["length"]
-    length: LengthTolerance | None = None
-    slopes: LengthTolerance | None = None
+    length: placement.LengthTolerance | None = None
+    slopes: placement.LengthTolerance | None = None
 
 
 Coupling = AngleCoupling | LengthCoupling
@@ -324,7 +310,7 @@ class Term(NamedTuple):
 
     dimension: Dimension
     nominal: float
-    tolerance: ToleranceRecord | None
+    tolerance: placement.ToleranceRecord | None
     maps: Mapping[str, float]
     positive: bool = False
 
@@ -356,7 +342,7 @@ class SumPart(NamedTuple):
     items: Iterable[tuple[str, float]]
     turns: bool
     dimension: Dimension
-    tolerance: ToleranceRecord | None
+    tolerance: placement.ToleranceRecord | None
 
 
 def list_parts(stated: Drive | Coupling) -> tuple[SumPart, ...]:
@@ -509,8 +495,10 @@ class PlacedRow:
 
 
 def row_errors(
-    row: PlacedRow, unknown: Iterable[str] | None = None, spread: LinkTolerances | None = None
-) -> ErrorModel:
+    row: PlacedRow,
+    unknown: Iterable[str] | None = None,
+    spread: placement.LinkTolerances | None = None,
+) -> placement.ErrorModel:
     """Return the unknown terms of a drive or coupling, `q1.offset`, `gear.weight.arm.pin` ..; what
     stands before a point, and `table`, means all of a kind. Raises RecordError for impossible ones.
 
@@ -530,16 +518,22 @@ def row_errors(
             if not changes:
                 sentence = f"has {term}, which rotates its triangle about the joint's own axis and"
                 raise row.drive.refuse(name, f"{sentence} changes no length. Leave it out")
-            sd = spread.select(dimension) if spread else standard_deviation(tolerance, parameter)
+            sd = (
+                spread.select(dimension)
+                if spread
+                else placement.standard_deviation(tolerance, parameter)
+            )
             maps = [
                 LinearMap(parameter, Address(name, "transmission", axis), change)
                 for axis, change in changes.items()
             ]
-            errors.append(single_error(parameter, dimension, nominal, sd, *maps, positive=positive))
-    return join_errors(errors)
+            errors.append(
+                placement.single_error(parameter, dimension, nominal, sd, *maps, positive=positive)
+            )
+    return placement.join_errors(errors)
 
 
-def complete_row(row: PlacedRow, spread: LinkTolerances) -> ErrorModel:
+def complete_row(row: PlacedRow, spread: placement.LinkTolerances) -> placement.ErrorModel:
     """Return the offset of a drive or coupling, and those dimensions of a triangle that, with the
     offset, have the effects of all others, as parameters.
 
@@ -568,7 +562,7 @@ def list_conditions(stated: Mapping[str, Condition]) -> Iterator[Actuator]:
     for name, condition in stated.items():
         dimension = get_condition_dimension(name)
         if dimension.value != name.partition(".")[0]:
-            raise RecordError(
+            raise placement.RecordError(
                 f"the condition {name!r} is not a column of times, temperatures or loads. Call it "
                 f"temperature, temperature.PLACE, time, or one of {', '.join(FORCES)}",
                 "conditions",
@@ -578,12 +572,12 @@ def list_conditions(stated: Mapping[str, Condition]) -> Iterator[Actuator]:
 
 
 def place_rows(
-    limbs: Sequence[PlacedLimb],
+    limbs: Sequence[placement.PlacedLimb],
     stated: Mapping[str, Drive],
     own: Iterable[Actuator],
     couplings: Mapping[str, Coupling],
     conditions: Mapping[str, Condition],
-) -> tuple[tuple[PlacedLimb, ...], dict[str, PlacedRow], dict[str, PlacedRow]]:
+) -> tuple[tuple[placement.PlacedLimb, ...], dict[str, PlacedRow], dict[str, PlacedRow]]:
     """Return the limbs, with `limb.joint` as the drive of each passive joint that a sum names, and
     by name drives in the order of the readings and couplings, those of limbs that are copied one
     for each copy. Raises RecordError where joints and rows do not fit.
@@ -602,7 +596,7 @@ def place_rows(
             coupled[name] = PlacedRow(name, coupling, names, first, base, reference)
     for condition in conditions:
         if all(coupling.condition != condition for coupling in couplings.values()):
-            raise RecordError(
+            raise placement.RecordError(
                 f"the condition {condition!r} is in no coupling. Name it there, or leave it out",
                 "conditions",
                 condition,
@@ -614,7 +608,7 @@ def place_rows(
         for name, names in _name_joints(key, stated[key], joints, known)
     }
     for name, joint in joints.items():
-        groups = (key for key in (joint.stated, strip_number(name)) if key not in joints)
+        groups = (key for key in (joint.stated, placement.strip_number(name)) if key not in joints)
         key = next((key for key in (name, *groups) if key in stated), None)
         if not joint.is_passive and key not in sums and (key or not sums):
             keys[name] = key, {}
@@ -630,7 +624,7 @@ def place_rows(
         drives[name] = PlacedRow(name, drive, names, joint, base)
         _check_drive(drives[name], drive)
     groups = {joint.stated for joint in joints.values() if not joint.is_passive}
-    refuse_idle_drives(stated, drives, groups.union(sums, map(strip_number, drives)))
+    refuse_idle_drives(stated, drives, groups.union(sums, map(placement.strip_number, drives)))
     used = {joint for row in (*coupled.values(), *drives.values()) for joint in row.weights}
     if used:
         driven = {name: of.limb for name, of in joints.items() if name in used or not of.is_passive}
@@ -652,7 +646,7 @@ def place_rows(
 
 
 def find_driven_joints(
-    limbs: Iterable[PlacedLimb],
+    limbs: Iterable[placement.PlacedLimb],
 ) -> tuple[dict[str, DrivenJoint], dict[str, list[str]]]:
     """Return all joints and rods under the names of their drives, passive ones as `limb.joint`, and
     the names that each name in a file means.
@@ -748,7 +742,7 @@ def _check_rows(rows: Mapping[str, PlacedRow], known: Mapping[str, str]) -> None
     read = {joint for weights in sums.values() for joint, w in weights.items() if w != 0.0}
     unread = [joint for joint in known if joint not in read]
     if unread:
-        raise RecordError(
+        raise placement.RecordError(
             f"joint {unread[0]!r} of limb {known[unread[0]]!r} is in no sum, so its readings are "
             f"missing. Add it to a `sum:`, or list {unread[0]!r} among the actuators",
             "drives",

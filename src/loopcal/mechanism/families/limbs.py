@@ -31,37 +31,15 @@ from loopcal.mechanism.assembly import (
     Limb,
     refuse_more,
 )
-from loopcal.mechanism.families.placement import (
-    EX,
-    EY,
-    EZ,
-    AngleTolerance,
-    ErrorModel,
-    Freedom,
-    JointPlacement,
-    LengthTolerance,
-    LinkTolerances,
-    PlacedLimb,
-    Point,
-    PoseRecord,
-    displacement_error,
-    join_errors,
-    map_slide_tilt,
-    place_limb,
-    rod_length_error,
-    rotate_about,
-    single_error,
-    standard_deviation,
-    translate,
-)
+from loopcal.mechanism.families import placement
 from loopcal.mechanism.families.records import RobotRecord
 from loopcal.mechanism.limb_rows import move_joint
 from loopcal.typing import FloatArray
 from loopcal.units import Angle, Dimension, Length, Ratio
 
 Axis = Literal["x", "y", "z", "-x", "-y", "-z"] | tuple[Ratio, Ratio, Ratio]
-Place = Point | PoseRecord
-ORIGIN: Point = (0.0, 0.0, 0.0)
+Place = placement.Point | placement.PoseRecord
+ORIGIN: placement.Point = (0.0, 0.0, 0.0)
 Moving = Literal["x", "y", "z", "length"]
 Turning = Literal["rx", "ry", "rz"]
 
@@ -75,7 +53,7 @@ def axis_vector(axis: Axis) -> FloatArray:
 
 def matrix_from_place(place: Place) -> FloatArray:
     """Return a placement as (4, 4)."""
-    return place.matrix if isinstance(place, PoseRecord) else translate(*place)
+    return place.matrix if isinstance(place, placement.PoseRecord) else placement.translate(*place)
 
 
 @dataclass(frozen=True)
@@ -173,7 +151,7 @@ class Shifts:
     of: str
     shift: tuple[Moving, ...]
     name: str = ""
-    tolerance: LengthTolerance | None = None
+    tolerance: placement.LengthTolerance | None = None
 
 
 @dataclass(frozen=True)
@@ -187,7 +165,7 @@ class Tilts:
     tilt: tuple[Turning, ...]
     name: str = ""
     alone: bool = False
-    tolerance: AngleTolerance | None = None
+    tolerance: placement.AngleTolerance | None = None
 
 
 @dataclass(frozen=True)
@@ -213,7 +191,7 @@ class BodyRecord:
     """
 
     name: str
-    home: PoseRecord | None = None
+    home: placement.PoseRecord | None = None
     copies: Copies | None = None
 
 
@@ -258,12 +236,12 @@ class Limbs(RobotRecord):
 
     family = "limbs"
 
-    freedoms: tuple[Freedom, ...] = ("rx", "ry", "rz", "x", "y", "z")
+    freedoms: tuple[placement.Freedom, ...] = ("rx", "ry", "rz", "x", "y", "z")
     controlled: tuple[str, ...] = ()
     bodies: tuple[BodyRecord, ...] = ()
     limbs: tuple[LimbRecord, ...] = ()
     error_model: Literal["ideal", "complete"] = "ideal"
-    tolerances: LinkTolerances = field(default_factory=LinkTolerances)
+    tolerances: placement.LinkTolerances = field(default_factory=placement.LinkTolerances)
     closure: Literal["exact", "least-squares"] = "exact"
 
     def expand(self) -> Assembly:
@@ -282,7 +260,7 @@ class Limbs(RobotRecord):
         named = {body.name: body for body in self.bodies}
         copies = [copy for limb in self.limbs for copy in _copies(limb, named)]
         placed = [limb for _, limb in copies]
-        errors = join_errors(
+        errors = placement.join_errors(
             error
             for record, limb in copies
             for entry in record.errors
@@ -301,7 +279,7 @@ class Limbs(RobotRecord):
 
 def _copies(
     limb: LimbRecord, bodies: Mapping[str, BodyRecord]
-) -> Iterator[tuple[LimbRecord, PlacedLimb]]:
+) -> Iterator[tuple[LimbRecord, placement.PlacedLimb]]:
     """Yield the copies of a limb, each with its record."""
     count = 0 if limb.copies is None else limb.copies.count
     for end in {limb.on, limb.to}.intersection(bodies):
@@ -324,7 +302,7 @@ def _list_turns(copies: Copies | None) -> list[FloatArray]:
         return [np.eye(4)]
     step = copies.step if copies.step is not None else 2 * np.pi / copies.count
     axis = axis_vector(copies.about)
-    return [rotate_about(axis, copies.start + i * step) for i in range(copies.count)]
+    return [placement.rotate_about(axis, copies.start + i * step) for i in range(copies.count)]
 
 
 def _place_bodies(record: Limbs, limbs: Sequence[Limb]) -> dict[str, FloatArray]:
@@ -401,7 +379,7 @@ def _check_ends(limbs: Sequence[Limb], names: Sequence[str]) -> None:
 
 def _place_copy(
     limb: LimbRecord, suffix: str, turn: FloatArray, bodies: Mapping[str, BodyRecord]
-) -> PlacedLimb:
+) -> placement.PlacedLimb:
     """Return one copy of a limb, rotated, with the suffix on its names; in a body with copies of
     its own it is not rotated.
     """
@@ -415,7 +393,7 @@ def _place_copy(
             f"limb {limb.name!r} ends in a rod that no drive moves, of length {limb.length:g} m; "
             "it needs a positive `length:`"
         )
-    steps: list[JointPlacement] = []
+    steps: list[placement.JointPlacement] = []
     for i, joint in enumerate(limb.chain):
         number = 1 + sum(other.joint == joint.joint for other in limb.chain[:i])
         steps += _place_joint(joint, joint.name or f"{joint.joint}{number}", suffix)
@@ -440,7 +418,7 @@ def _place_copy(
                 f"limb {limb.name!r} has a joint {limb.to!r}, like the body on which it ends. "
                 "Rename the joint"
             )
-    placed = place_limb(
+    placed = placement.place_limb(
         limb.name + suffix,
         tuple(steps),
         tip,
@@ -454,7 +432,7 @@ def _place_copy(
     return placed._replace(limb=replace(placed.limb, on=on, to=to), stem=limb.name)
 
 
-def _place_joint(record: JointRecord, name: str, suffix: str) -> list[JointPlacement]:
+def _place_joint(record: JointRecord, name: str, suffix: str) -> list[placement.JointPlacement]:
     """Return a joint as R and P joints, the first one where the record places it."""
     if isinstance(record, Revolute | Prismatic):
         drive = record.actuated + suffix if record.actuated else None
@@ -470,14 +448,20 @@ def _place_joint(record: JointRecord, name: str, suffix: str) -> list[JointPlace
     else:
         joints = [Joint(f"{name}.{i + 1}", "R", start=s) for i, s in enumerate(record.start)]
         is_universal = isinstance(record, Universal)
-        axes = [axis_vector(axis) for axis in record.axes] if is_universal else [EZ, EY, EX]
+        axes = (
+            [axis_vector(axis) for axis in record.axes]
+            if is_universal
+            else [placement.EZ, placement.EY, placement.EX]
+        )
     places = [matrix_from_place(record.at), np.eye(4), np.eye(4)]
-    return [JointPlacement(*step) for step in zip(joints, places, axes, strict=False)]
+    return [placement.JointPlacement(*step) for step in zip(joints, places, axes, strict=False)]
 
 
-def _list_errors(limb: PlacedLimb, entry: Shifts | Tilts) -> Iterator[ErrorModel]:
+def _list_errors(
+    limb: placement.PlacedLimb, entry: Shifts | Tilts
+) -> Iterator[placement.ErrorModel]:
     """Yield the unknown lengths or angles of a limb."""
-    sd = standard_deviation(entry.tolerance, f"{limb.name} {entry.of}")
+    sd = placement.standard_deviation(entry.tolerance, f"{limb.name} {entry.of}")
     label = f"{limb.name}.{entry.name or entry.of}"
     for axis in entry.shift if isinstance(entry, Shifts) else entry.tilt:
         name = f"{label}.{axis}"
@@ -487,9 +471,11 @@ def _list_errors(limb: PlacedLimb, entry: Shifts | Tilts) -> Iterator[ErrorModel
                     f"{limb.name!r}: 'length' belongs to a rod. Write 'of: rod' in a limb that "
                     "ends in a distance"
                 )
-            yield rod_length_error(limb, label if entry.name else f"{limb.name}.length", sd)
+            yield placement.rod_length_error(
+                limb, label if entry.name else f"{limb.name}.length", sd
+            )
         elif isinstance(entry, Tilts) and entry.alone:
-            maps = map_slide_tilt(name, limb, limb.find_element(entry.of), axis)
-            yield single_error(name, Dimension.ANGLE, 0.0, sd, *maps)
+            maps = placement.map_slide_tilt(name, limb, limb.find_element(entry.of), axis)
+            yield placement.single_error(name, Dimension.ANGLE, 0.0, sd, *maps)
         else:
-            yield displacement_error(name, limb, limb.find_element(entry.of), axis, sd)
+            yield placement.displacement_error(name, limb, limb.find_element(entry.of), axis, sd)

@@ -16,6 +16,7 @@ import numpy as np
 
 from loopcal.errors import MechanismError, suggest_names
 from loopcal.mechanism.assembly import AXES, FORCES, Actuator, Address, Assembly, LinearMap
+from loopcal.mechanism.families import placement
 from loopcal.mechanism.families.drives import (
     Condition,
     Coupling,
@@ -29,22 +30,6 @@ from loopcal.mechanism.families.drives import (
     place_rows,
     row_errors,
 )
-from loopcal.mechanism.families.placement import (
-    AngleTolerance,
-    ErrorModel,
-    Freedom,
-    LengthTolerance,
-    LinkTolerances,
-    PlacedLimb,
-    PoseRecord,
-    RatioTolerance,
-    RecordError,
-    complete_limbs,
-    join_errors,
-    map_displacement,
-    single_error,
-    standard_deviation,
-)
 from loopcal.mechanism.transmission import LOAD
 from loopcal.parameters import CommonError, Parameter
 from loopcal.units import ARTICLES, Angle, Dimension, Length, Ratio
@@ -52,7 +37,7 @@ from loopcal.units import ARTICLES, Angle, Dimension, Length, Ratio
 # Named parameters: numbers of one's own that several limbs or drives share.
 
 Movable = Literal["length", "lead", "pitch", "offset", "gain", "curve", "backlash"]
-MapAxis = Literal[Freedom, Movable]
+MapAxis = Literal[placement.Freedom, Movable]
 # What named parameters are mapped onto that keeps its sign: rods, screws and scales.
 POSITIVE = ("length", "lead", "gain")
 
@@ -100,7 +85,7 @@ class NamedLength(NamedRecord):
 
     length: Length
     maps: tuple[MapEntry, ...]
-    tolerance: LengthTolerance | None = None
+    tolerance: placement.LengthTolerance | None = None
     positive: bool = False
 
 
@@ -112,7 +97,7 @@ class NamedAngle(NamedRecord):
 
     angle: Angle
     maps: tuple[MapEntry, ...]
-    tolerance: AngleTolerance | None = None
+    tolerance: placement.AngleTolerance | None = None
 
 
 @dataclass(frozen=True)
@@ -121,15 +106,15 @@ class NamedRatio(NamedRecord):
 
     ratio: Ratio
     maps: tuple[MapEntry, ...]
-    tolerance: RatioTolerance | None = None
+    tolerance: placement.RatioTolerance | None = None
 
 
 NamedParameter = NamedLength | NamedAngle | NamedRatio
 
 
 def named_error(
-    named: NamedParameter, limbs: Sequence[PlacedLimb], drives: Mapping[str, PlacedRow]
-) -> ErrorModel:
+    named: NamedParameter, limbs: Sequence[placement.PlacedLimb], drives: Mapping[str, PlacedRow]
+) -> placement.ErrorModel:
     """Return a named parameter with its maps onto limbs and drives."""
     name, nominal, is_positive = named.name, named.nominal, getattr(named, "positive", False)
     if is_positive and not nominal > 0.0:
@@ -138,9 +123,9 @@ def named_error(
             "Correct the value, or leave out 'positive'"
         )
     is_positive = is_positive or any(entry.axis in POSITIVE for entry in named.maps)
-    sd = standard_deviation(named.tolerance, name)
+    sd = placement.standard_deviation(named.tolerance, name)
     maps = [m for entry in named.maps for m in _map_entry(named, entry, limbs, drives)]
-    return single_error(name, named.GIVEN, nominal, sd, *maps, positive=is_positive)
+    return placement.single_error(name, named.GIVEN, nominal, sd, *maps, positive=is_positive)
 
 
 def _check_units(named: NamedParameter, entry: MapEntry, drive: PlacedRow | None) -> None:
@@ -173,7 +158,7 @@ def _check_units(named: NamedParameter, entry: MapEntry, drive: PlacedRow | None
 def _map_entry(
     named: NamedParameter,
     entry: MapEntry,
-    limbs: Sequence[PlacedLimb],
+    limbs: Sequence[placement.PlacedLimb],
     drives: Mapping[str, PlacedRow],
 ) -> Iterator[LinearMap]:
     """Yield the maps of one entry, for every copy that it means. A file states a lead per turn, the
@@ -204,7 +189,7 @@ def _map_entry(
     for limb in chosen:
         if axis in AXES:
             element = limb.find_element(entry.element)
-            yield from map_displacement(name, limb, element, axis, coefficient)
+            yield from placement.map_displacement(name, limb, element, axis, coefficient)
         else:
             yield LinearMap(name, Address(limb.name, entry.element, axis), coefficient)
 
@@ -222,9 +207,9 @@ class CommonErrorRecord:
 
     name: str
     of: tuple[str, ...]
-    length: LengthTolerance | None = None
-    angle: AngleTolerance | None = None
-    ratio: RatioTolerance | None = None
+    length: placement.LengthTolerance | None = None
+    angle: placement.AngleTolerance | None = None
+    ratio: placement.RatioTolerance | None = None
 
     def resolve(self, parameters: Sequence[Parameter], place: int) -> CommonError:
         """Return the common error of the parameters that match; raises RecordError for unlike
@@ -233,8 +218,8 @@ class CommonErrorRecord:
         """
         at = ("common_errors", place)
 
-        def refuse(sentence: str) -> RecordError:
-            return RecordError(f"common error {self.name!r} {sentence}", *at)
+        def refuse(sentence: str) -> placement.RecordError:
+            return placement.RecordError(f"common error {self.name!r} {sentence}", *at)
 
         stated = {d: t for d in Dimension if (t := getattr(self, d.value, None)) is not None}
         if len(stated) != 1:
@@ -242,9 +227,9 @@ class CommonErrorRecord:
             raise refuse(f"has {len(stated)} expected spreads. {example}")
         ((dimension, tolerance),) = stated.items()
         try:
-            sd = standard_deviation(tolerance, f"common error {self.name!r}")
+            sd = placement.standard_deviation(tolerance, f"common error {self.name!r}")
         except MechanismError as error:
-            raise RecordError(str(error), *at, dimension.value) from None
+            raise placement.RecordError(str(error), *at, dimension.value) from None
         assert sd is not None
         matching = match_parameter_names(self.of, [p.name for p in parameters], *at, "of")
         chosen = [parameter for parameter in parameters if parameter.name in matching]
@@ -327,8 +312,8 @@ class RobotRecord:
 
     name: str
     source: str = ""
-    home: PoseRecord = field(default_factory=PoseRecord)
-    tool: PoseRecord = field(default_factory=PoseRecord)
+    home: placement.PoseRecord = field(default_factory=placement.PoseRecord)
+    tool: placement.PoseRecord = field(default_factory=placement.PoseRecord)
     workspace: Workspace = field(default_factory=Workspace)
     fixed: tuple[str, ...] = ()
     stored_parameters: tuple[str, ...] = ()
@@ -345,14 +330,14 @@ class RobotRecord:
 
     def assemble(
         self,
-        limbs: Iterable[PlacedLimb],
-        errors: ErrorModel,
+        limbs: Iterable[placement.PlacedLimb],
+        errors: placement.ErrorModel,
         *,
         freedoms: tuple[str, ...],
         controlled: tuple[str, ...],
         own: Iterable[Actuator] = (),
-        complete: LinkTolerances | None = None,
-        later: ErrorModel | None = None,
+        complete: placement.LinkTolerances | None = None,
+        later: placement.ErrorModel | None = None,
     ) -> Assembly:
         """Return the assembly of limbs at the home pose of this record, with the drives and
         parameters that it states.
@@ -367,7 +352,7 @@ class RobotRecord:
             tuple(limbs), self.drives, own, self.couplings, columns
         )
         rows = {**drives, **couplings}
-        errors = join_errors(
+        errors = placement.join_errors(
             (
                 errors,
                 *map(row_errors, rows.values()),
@@ -377,7 +362,7 @@ class RobotRecord:
         )
         if complete is not None:
             every = [complete_row(row, complete) for row in {**couplings, **drives}.values()]
-            all_errors = complete_limbs(limbs, complete) + join_errors(every)
+            all_errors = placement.complete_limbs(limbs, complete) + placement.join_errors(every)
             errors = all_errors.without_effects_of(errors) + errors
         return Assembly(
             self.name,
@@ -421,7 +406,7 @@ class RobotRecord:
         load = self.load.place(self.conditions)
         is_elastic = any(a.name.startswith(LOAD) for a in expanded.actuators)
         if not is_elastic and (load.stated or self.load != LoadFrame()):
-            raise RecordError(
+            raise placement.RecordError(
                 f"{self.name} has a load, but no drive with a compliance. Give a `compliance:` "
                 "under `drives:`",
                 "conditions" if load.stated else "load",
@@ -448,7 +433,7 @@ def match_parameter_names(
         if not matching:
             hint = suggest_names(pattern, names) or f"; its parameters are {', '.join(names)}"
             sentence = f"{pattern!r} under `{key[0]}` matches no parameter of this robot{hint}"
-            raise RecordError(f"{sentence}. Correct it", *key, i)
+            raise placement.RecordError(f"{sentence}. Correct it", *key, i)
         found.update(matching)
     return found
 

@@ -28,6 +28,7 @@ from loopcal.mechanism.assembly import (
     Limb,
     LinearMap,
 )
+from loopcal.mechanism.families import placement
 from loopcal.mechanism.families.drives import (
     Drive,
     LoadFrame,
@@ -46,26 +47,6 @@ from loopcal.mechanism.families.limbs import (
     follow_rigid_limbs,
     matrix_from_place,
 )
-from loopcal.mechanism.families.placement import (
-    AngleTolerance,
-    ErrorModel,
-    Freedom,
-    JointPlacement,
-    LengthTolerance,
-    LinkTolerances,
-    PlacedLimb,
-    PoseRecord,
-    RatioTolerance,
-    RecordError,
-    displacement_error,
-    get_axis_dimension,
-    join_errors,
-    offset_error,
-    place_limb,
-    single_error,
-    standard_deviation,
-    strip_number,
-)
 from loopcal.mechanism.families.records import RobotRecord
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension, Given, Ratio
@@ -73,7 +54,7 @@ from loopcal.units import Dimension, Given, Ratio
 # The assembly of a chain: those of its stages, with the stage before each name.
 
 
-class StageError(RecordError):
+class StageError(placement.RecordError):
     """An impossible stage of a chain; `index` is its place in the list of stages."""
 
     def __init__(self, sentence: str, index: int) -> None:
@@ -164,11 +145,13 @@ def couple_stages(record: Stages, chain: Assembly) -> Assembly:
         limbs, rest = limbs + moved, rest[len(own.limbs) :]
     conditions = {name: of for name, of in record.conditions.items() if name not in FORCES}
     placed = [
-        PlacedLimb(limb, {j.name: np.eye(3) for j in limb.joints}, {}, strip_number(limb.name))
+        placement.PlacedLimb(
+            limb, {j.name: np.eye(3) for j in limb.joints}, {}, placement.strip_number(limb.name)
+        )
         for limb in limbs
     ]
     placed, _, rows = place_rows(placed, {}, (), record.couplings, conditions)
-    errors = join_errors(map(row_errors, rows.values()))
+    errors = placement.join_errors(map(row_errors, rows.values()))
     return replace(
         chain,
         limbs=tuple(limb.limb for limb in placed),
@@ -250,7 +233,7 @@ def _refuse_wrong_drives(stages: Sequence[AttachedStage], is_coupled: bool) -> N
         owner |= dict.fromkeys(own, stage.name)
 
 
-JointError = Literal[Freedom, "offset", "gain"]
+JointError = Literal[placement.Freedom, "offset", "gain"]
 LIMB, LINK, PASSIVE = "serial", "joint", "none"
 """Names of the limb and of the joint of a serial stage, and of no drive."""
 
@@ -279,10 +262,10 @@ class SerialJoint:
     gain: Ratio = 1.0
     sigma: Given | None = None
     errors: tuple[JointError, ...] = ()
-    platform_errors: tuple[Freedom, ...] = ()
-    length: LengthTolerance | None = None
-    angle: AngleTolerance | None = None
-    ratio: RatioTolerance | None = None
+    platform_errors: tuple[placement.Freedom, ...] = ()
+    length: placement.LengthTolerance | None = None
+    angle: placement.AngleTolerance | None = None
+    ratio: placement.RatioTolerance | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -323,7 +306,7 @@ class StageRecord:
 
     name: str
     on: str | None = None
-    mount: PoseRecord = field(default_factory=PoseRecord)
+    mount: placement.PoseRecord = field(default_factory=placement.PoseRecord)
     joint: SerialRotation | SerialSlide | None = None
     family: str | None = None
 
@@ -343,7 +326,7 @@ class Stages(RobotRecord):
     controlled: tuple[str, ...] = ()
     stages: tuple[StageRecord, ...] = ()
     held: tuple[str, ...] = ()
-    tolerances: LinkTolerances = field(default_factory=LinkTolerances)
+    tolerances: placement.LinkTolerances = field(default_factory=placement.LinkTolerances)
 
     def expand(self) -> Assembly:
         """Refuse: the robots of the stages are not known, see `PlacedStages`."""
@@ -364,10 +347,16 @@ class PlacedStages(Stages):
         is_coupled = bool(self.couplings) or any(name not in FORCES for name in self.conditions)
         for key, is_stated, remedy in (
             ("parameters", bool(self.parameters), "Give them in a stage that has a `family:`"),
-            ("home", self.home != PoseRecord(), "Give `start:` of a joint or `home:` of a stage"),
+            (
+                "home",
+                self.home != placement.PoseRecord(),
+                "Give `start:` of a joint or `home:` of a stage",
+            ),
         ):
             if is_stated:
-                raise RecordError(f"{self.name} states `{key}:` of a whole chain. {remedy}", key)
+                raise placement.RecordError(
+                    f"{self.name} states `{key}:` of a whole chain. {remedy}", key
+                )
         names = [stage.name for stage in self.stages]
         parents = check_stage_names(names, [stage.on for stage in self.stages])
         assemblies, strokes = list[Assembly](), dict[str, str]()
@@ -383,7 +372,7 @@ class PlacedStages(Stages):
             for stage, on, own in zip(self.stages, parents, assemblies, strict=True)
         )
         actuators = [a.name for stage in attached for a in stage.assembly.actuators]
-        refuse_idle_drives(self.drives, actuators, map(strip_number, actuators))
+        refuse_idle_drives(self.drives, actuators, map(placement.strip_number, actuators))
         chain = join_stages(self, attached)
         return couple_stages(self, chain) if is_coupled else chain
 
@@ -400,7 +389,7 @@ class PlacedStages(Stages):
         assert robot is not None
         is_loaded = robot.load != LoadFrame() or any(name in FORCES for name in robot.conditions)
         for key, is_stated, remedy in (
-            ("tool", robot.tool != PoseRecord(), "or as the mount of the next stage"),
+            ("tool", robot.tool != placement.PoseRecord(), "or as the mount of the next stage"),
             ("load", is_loaded, "whose end platform it acts on"),
         ):
             if is_stated:
@@ -418,7 +407,7 @@ class PlacedStages(Stages):
 
 def _select_drives(drives: Mapping[str, Drive], names: Sequence[str]) -> dict[str, Drive]:
     """Return those of the stated drives that mean one of these actuators."""
-    meant = {*names, *map(strip_number, names)}
+    meant = {*names, *map(placement.strip_number, names)}
     return {name: drive for name, drive in drives.items() if name in meant}
 
 
@@ -437,12 +426,12 @@ def expand_joint(
     joint = Joint(
         LINK, record.kind, None if is_passive else drive, start=record.gain * record.start
     )
-    step = JointPlacement(joint, matrix_from_place(record.at), axis_vector(record.axis))
-    limb = place_limb(LIMB, (step,), matrix_from_place(record.tip), "rigid", np.eye(4))
+    step = placement.JointPlacement(joint, matrix_from_place(record.at), axis_vector(record.axis))
+    limb = placement.place_limb(LIMB, (step,), matrix_from_place(record.tip), "rigid", np.eye(4))
     own = Actuator(drive, record.GIVEN, record.stroke, {"gain": record.gain}, sigma=record.sigma)
     stated = _select_drives(drives, [drive])
     if triangle is not None and stated:
-        raise RecordError(
+        raise placement.RecordError(
             f"the drive {drive!r} appears twice, at its joint and under `drives:`. Leave one out",
             "drives",
             drive,
@@ -450,9 +439,13 @@ def expand_joint(
     if is_passive and not {"offset", "gain"}.isdisjoint(record.errors):
         raise MechanismError(f"the joint has no drive, and so no {' or '.join(record.errors)}")
     robot = RobotRecord(name, drives={drive: triangle} if triangle else stated)
-    errors = join_errors(_joint_error(record, limb, drive, error) for error in record.errors)
-    of_platform = join_errors(
-        displacement_error(f"platform.{axis}", limb, "platform", axis, _tolerance(record, axis))
+    errors = placement.join_errors(
+        _joint_error(record, limb, drive, error) for error in record.errors
+    )
+    of_platform = placement.join_errors(
+        placement.displacement_error(
+            f"platform.{axis}", limb, "platform", axis, _tolerance(record, axis)
+        )
         for axis in record.platform_errors
     )
     return robot.assemble(
@@ -475,19 +468,19 @@ def _refuse_terms_beside_triangle(record: SerialRotation | SerialSlide, drive: s
 
 
 def _joint_error(
-    record: SerialRotation | SerialSlide, limb: PlacedLimb, drive: str, error: str
-) -> ErrorModel:
+    record: SerialRotation | SerialSlide, limb: placement.PlacedLimb, drive: str, error: str
+) -> placement.ErrorModel:
     """Return one unknown of a serial joint."""
     if error == "gain":
         gain = LinearMap(error, Address(drive, "transmission", error))
-        sd = standard_deviation(record.ratio, error)
-        return single_error(error, Dimension.RATIO, record.gain, sd, gain, positive=True)
+        sd = placement.standard_deviation(record.ratio, error)
+        return placement.single_error(error, Dimension.RATIO, record.gain, sd, gain, positive=True)
     if error == "offset":
-        return offset_error(error, drive, record.GIVEN, 0.0, _tolerance(record, error))
-    return displacement_error(error, limb, LINK, error, _tolerance(record, error))
+        return placement.offset_error(error, drive, record.GIVEN, 0.0, _tolerance(record, error))
+    return placement.displacement_error(error, limb, LINK, error, _tolerance(record, error))
 
 
 def _tolerance(record: SerialRotation | SerialSlide, error: str) -> float | None:
     """Return the tolerance of an unknown of a serial joint that is a length or an angle."""
-    dimension = get_axis_dimension(error) if error in AXES else record.GIVEN
-    return standard_deviation(getattr(record, dimension.value), error)
+    dimension = placement.get_axis_dimension(error) if error in AXES else record.GIVEN
+    return placement.standard_deviation(getattr(record, dimension.value), error)

@@ -41,16 +41,8 @@ from loopcal.mechanism.sensitivity import differentiate_pose
 from loopcal.mechanism.solutions import forward
 from loopcal.mechanism.states import Status
 from loopcal.numerics.gauss_newton import DescentStatus
+from loopcal.studies import specification
 from loopcal.studies.simulation import machines, published_steps
-from loopcal.studies.specification import (
-    PER_LEG,
-    MethodLevel,
-    Study,
-    compute_key,
-    describe_cell,
-    format_json,
-    list_columns,
-)
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension
 
@@ -152,7 +144,7 @@ def fit_together(cell: machines.PreparedCell, trials: Trials, threads: int = 1) 
 
 
 def fit_per_leg(
-    robot: Mechanism, data: Measurements, method: MethodLevel
+    robot: Mechanism, data: Measurements, method: specification.MethodLevel
 ) -> published_steps.PerLegEstimate:
     """Fit leg by leg. EstimationError as of `identify_per_leg`."""
     steps, epsilon = method.steps or published_steps.LEG_STEPS, method.epsilon or 0.0
@@ -169,7 +161,7 @@ def fit_published(cell: machines.PreparedCell, trials: Trials) -> FittedTrials:
     values, outcome, scores = fits.values, fits.outcome, dict[str, Any]()
     if method.is_of_products:
         values, outcome, iterations, scores["rank"] = _fit_products(cell, trials)
-    elif method.method == PER_LEG:
+    elif method.method == specification.PER_LEG:
         iterations = np.zeros(len(trials), dtype=np.int64)
         for i in range(len(trials)):
             with suppress(EstimationError, DataError):
@@ -397,7 +389,7 @@ def compute_block(task: BlockTask, threads: int = 1) -> FloatArray:
     content = json.loads(task.content)
     cell, trials, fits = calibrate_block(content, threads)
     stream = make_stream(cell.content.seed, content["block"])
-    names = [column.name for column in list_columns(cell.content.scores)]
+    names = [column.name for column in specification.list_columns(cell.content.scores)]
     scores: dict[str, Any] = dict.fromkeys(names, np.nan)
     scores |= score_poses(cell, trials, fits, stream) | score_parameters(cell, trials, fits)
     scores |= fits.scores
@@ -419,24 +411,26 @@ def compute_plan(task: PosesTask) -> machines.CellPoses:
 def make_poses_task(content: Mapping[str, Any]) -> PosesTask:
     """Return the task of the poses of a block, from its description."""
     description = machines.describe_poses(content)
-    return PosesTask(compute_key(description), format_json(description))
+    return PosesTask(specification.compute_key(description), specification.format_json(description))
 
 
 def make_block_task(cell: int, content: Mapping[str, Any], poses: machines.CellPoses) -> BlockTask:
     """Return the task of a block of a cell, from its description and its poses."""
-    complete = format_json({**content, **vars(poses)})
-    return BlockTask(compute_key(content), cell, content["block"], complete)
+    complete = specification.format_json({**content, **vars(poses)})
+    return BlockTask(specification.compute_key(content), cell, content["block"], complete)
 
 
 def list_tasks(
-    study: Study, cells: Sequence[int] | None = None, blocks: Sequence[int] | None = None
+    study: specification.Study,
+    cells: Sequence[int] | None = None,
+    blocks: Sequence[int] | None = None,
 ) -> Iterator[BlockTask]:
     """Yield the tasks of these blocks of these cells, of all by default. The poses of a cell are
     drawn or planned here; the driver of a study leaves them to workers.
     """
     known = dict[str, machines.CellPoses]()
     for number in range(len(study.cells)) if cells is None else cells:
-        of_cell = describe_cell(study, study.cells[number])
+        of_cell = specification.describe_cell(study, study.cells[number])
         task = make_poses_task(of_cell)
         poses = known.get(task.key) or compute_plan(task)
         known[task.key] = poses
@@ -450,7 +444,7 @@ def calibrate_block(
     """Simulate and calibrate the machines of the content of a task, by so many threads."""
     cell, trials = (
         machines.prepare_cell(content),
-        _simulate(format_json(machines.share_content(content, "block"))),
+        _simulate(specification.format_json(machines.share_content(content, "block"))),
     )
     return cell, trials, fit_trials(cell, trials, threads)
 
@@ -615,7 +609,9 @@ class CalibratedCell:
         return self.outcome == 0
 
 
-def calibrate_cells(study: Study, cells: Sequence[int] | None = None) -> Iterator[CalibratedCell]:
+def calibrate_cells(
+    study: specification.Study, cells: Sequence[int] | None = None
+) -> Iterator[CalibratedCell]:
     """Yield the calibrations of these cells, of all by default, one cell after the other."""
     if not study.scores.verdict:  # held-out poses are not looked at
         study = replace(study, scores=replace(study.scores, held_out=1, frame="base"))
@@ -639,7 +635,7 @@ def calibrate_cells(study: Study, cells: Sequence[int] | None = None) -> Iterato
         )
 
 
-def find_cells(study: Study, **levels: str) -> tuple[int, ...]:
+def find_cells(study: specification.Study, **levels: str) -> tuple[int, ...]:
     """Return the numbers of the cells with these levels, factor=level."""
     return tuple(
         cell.number
@@ -648,7 +644,7 @@ def find_cells(study: Study, **levels: str) -> tuple[int, ...]:
     )
 
 
-def set_size(study: Study, seed: int, trials: int) -> Study:
+def set_size(study: specification.Study, seed: int, trials: int) -> specification.Study:
     """Return a study with another seed and so many trials in each cell; machine i of its first
     block is the same for any number of trials.
     """
@@ -656,7 +652,7 @@ def set_size(study: Study, seed: int, trials: int) -> Study:
 
 
 def replay_trial(
-    study: Study, cell: int, trial: int
+    study: specification.Study, cell: int, trial: int
 ) -> tuple[machines.PreparedCell, Mechanism, Measurements]:
     """Return the cell, the true machine and the measurements of a trial, to the last bit; trials of
     a cell are numbered from 0, over all of its blocks.
