@@ -11,6 +11,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from loopcal.diagnose import error_frames
 from loopcal.diagnose.adjusted_uncertainty import HeavyTails, check_heavy_tails
 from loopcal.diagnose.error_causes import (
     OUTLIERS,
@@ -18,12 +19,6 @@ from loopcal.diagnose.error_causes import (
     explain_residuals,
     find_swapped_pictures,
     measure_picture_errors,
-)
-from loopcal.diagnose.error_frames import (
-    FITTED,
-    compute_mean_squares,
-    linearize_tool_errors,
-    locate_measured_poses,
 )
 from loopcal.diagnose.model_discrepancy import LackOfFit, check_lack_of_fit
 from loopcal.diagnose.outliers import OutlierCheck, find_outliers
@@ -112,7 +107,7 @@ class CalibrationGain:
 
 
 def estimate_calibration_gain(
-    fit: Identification, data: Measurements, frame: str = FITTED
+    fit: Identification, data: Measurements, frame: str = error_frames.FITTED
 ) -> CalibrationGain:
     """Compare the errors expected after calibration with those that the stated spreads allow.
 
@@ -124,17 +119,19 @@ def estimate_calibration_gain(
     unknown = report_finding("model.gain-unknown", missing=missing, is_contradicted=is_contradicted)
     if missing or is_contradicted:
         return CalibrationGain(unknown)
-    solution = locate_measured_poses(fit, data, MOST_POSES)
+    solution = error_frames.locate_measured_poses(fit, data, MOST_POSES)
     # S with S S' the covariance of the estimate; undetermined directions keep their tolerance
     posterior = fit.posterior.without_discrepancy
     variance = np.where(np.isinf(posterior.variance), 1.0, posterior.variance)
     factor = posterior.directions * np.sqrt(variance)
     if not len(solution.q) or np.isnan(factor).any():
         return CalibrationGain(unknown)
-    effects = linearize_tool_errors(fit.posterior, solution, frame)
+    effects = error_frames.linearize_tool_errors(fit.posterior, solution, frame)
     D, own = effects.by_parameters, (effects.by_frame, effects.by_discrepancy)
     expected = (D * (free.tolerance / posterior.unit)) @ free.correlation_root()
-    squares = map(compute_mean_squares, (expected, np.concatenate([D @ factor, *own], axis=2)))
+    squares = map(
+        error_frames.compute_mean_squares, (expected, np.concatenate([D @ factor, *own], axis=2))
+    )
     # before and after, by orientation and position: 0 where they are rounding, such as the
     # orientation of a delta
     limits = (ROUNDING, ROUNDING * fit.robot.size)
@@ -209,7 +206,7 @@ def examine_fit(
     fit: Identification,
     data: Measurements,
     progress: Progress = report_no_progress,
-    frame: str = FITTED,
+    frame: str = error_frames.FITTED,
     linear: FitLinearization | None = None,
 ) -> FitExamination:
     """Examine a fit with the data it was made from.
