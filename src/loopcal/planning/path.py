@@ -37,6 +37,7 @@ POSES_AT_ONCE = 1 << 14  # poses of them, where a pose does not depend on the on
 # Difference of readings, in the robot's size or in radians, above which a path ended on another
 # branch than its end.
 BRANCH = 1e-6
+JUMP = 4.0  # times the mean step of its path: a longer step of spare drives is no even motion
 FIRST_POSES = 8  # first poses that the order of visiting tries
 # Share of the length by which a path must become shorter to count: rounding is no gain.
 LEAST_GAIN = 1e-12
@@ -102,8 +103,8 @@ def check_paths(
     for first in range(0, n, AT_ONCE):  # paths of similar length, in the same number of steps
         left = order[first : first + AT_ONCE]
         count = max(int(np.ceil(steps * (float(distance[left].max()) / robot.size))), 4)
-        if has_one_solution(robot):
-            violations[left] = _check_at_once(checker, start[left], end[left], count)
+        if has_one_solution(robot) or has_spare_drives(robot):
+            violations[left] = _check_at_once(checker, start[left], end[left], count, scale)
             # a step in another mode than home may still follow from the step before it
             left = left[[v is not None and v.code == "other-mode" for v in violations[left]]]
             if not len(left):
@@ -119,8 +120,6 @@ def check_paths(
             if not len(left):
                 break
         else:
-            if has_spare_drives(robot):  # the readings of an end depend on the way to it
-                continue
             difference = np.abs(solution.q - inverse(robot, end[left]).q) / scale
             violations[left[~(difference <= BRANCH).all(axis=1)]] = constraints.Violation(
                 "branch-changed"
@@ -130,12 +129,18 @@ def check_paths(
 
 
 def _check_at_once(
-    checker: constraints.ConstraintChecker, start: FloatArray, end: FloatArray, count: int
+    checker: constraints.ConstraintChecker,
+    start: FloatArray,
+    end: FloatArray,
+    count: int,
+    scale: FloatArray,
 ) -> list[constraints.Violation | None]:
-    """Return the first violations of n paths, all of whose steps are solved from home at once, of a
-    machine whose poses have one set of readings each.
+    """Return the first violations of n paths, all of whose steps are solved from home at once: of a
+    machine whose poses have one set of readings, or whose spare drives have those of the least
+    motion from home. These may jump by several `scale` (a,) from one step to the next.
     """
     share, first = np.arange(count + 1) / count, list[constraints.Violation | None]()
+    branch, may_jump = constraints.Violation("branch-changed"), has_spare_drives(checker.robot)
     at_once = max(POSES_AT_ONCE // len(share), 1)
     for i in range(0, len(start), at_once):
         begin, goal = (
@@ -145,7 +150,13 @@ def _check_at_once(
         solution = inverse(checker.robot, interpolate_path(checker.robot, begin, goal, shares))
         check = checker.check_poses(solution, at_pose=False, steps=len(share))
         step = check.allowed.reshape(-1, len(share)).argmin(axis=1)
-        first += check.violations.reshape(-1, len(share))[np.arange(len(step)), step].tolist()
+        found = check.violations.reshape(-1, len(share))[np.arange(len(step)), step]
+        if may_jump:
+            q = (solution.q / scale).reshape(len(step), len(share), -1)
+            length = np.linalg.norm(np.diff(q, axis=1), axis=2)
+            jumps = ~(length.max(axis=1) <= JUMP * length.mean(axis=1))
+            found[jumps & check.allowed.reshape(-1, len(share)).all(axis=1)] = branch
+        first += found.tolist()
     return first
 
 
