@@ -736,12 +736,8 @@ def solve_hand_eye(
     """
     A, B = T[:, :3, :3], measured[:, :3, :3]
     if tool is not None:
-        R_F = (
-            project_to_rotations(np.einsum("rij,jk,rlk->il", A, tool[:3, :3], B))
-            if frame is None
-            else frame[:3, :3]
-        )
         R_X = tool[:3, :3]
+        R_F = project_to_rotations(np.einsum("rij,jk,rlk->il", A, R_X, B))
     elif frame is not None:
         R_F = frame[:3, :3]
         R_X = project_to_rotations(np.einsum("rji,jk,rkl->il", A, R_F, B))
@@ -752,22 +748,15 @@ def solve_hand_eye(
         sign = 1.0 if np.linalg.det(left) > 0.0 else -1.0
         R_F, R_X = project_to_rotations(sign * left), project_to_rotations(sign * right)
     # R_F m + t_F = A t_X + t
-    identity = np.broadcast_to(np.eye(3), A.shape)
-    rhs = T[:, :3, 3] - measured[:, :3, 3] @ R_F.T
-    columns = []
+    t_F, t_X = (np.zeros(3) if known is None else known[:3, 3] for known in (frame, tool))
+    rhs = T[:, :3, 3] - measured[:, :3, 3] @ R_F.T - t_F + A @ t_X
+    parts = (np.broadcast_to(np.eye(3), A.shape), frame), (-A, tool)
+    columns = np.concatenate([part for part, known in parts if known is None], axis=-1)
+    solution = solve_least_squares(columns.reshape(rhs.size, -1), rhs.ravel())
     if frame is None:
-        columns.append(identity)
-    else:
-        rhs = rhs - frame[:3, 3]
+        t_F = solution[:3]
     if tool is None:
-        columns.append(-A)
-    else:
-        rhs = rhs + A @ tool[:3, 3]
-    solution = solve_least_squares(
-        np.concatenate(columns, axis=-1).reshape(rhs.size, -1), rhs.ravel()
-    )
-    t_F = solution[:3] if frame is None else frame[:3, 3]
-    t_X = solution[-3:] if tool is None else tool[:3, 3]
+        t_X = solution[-3:]
     return make_pose(R_F, t_F), make_pose(R_X, t_X)
 
 

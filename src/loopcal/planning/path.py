@@ -3,9 +3,9 @@
 
 A path is straight in the controlled coordinates: positions and angles change evenly, the shorter
 way round, and a tilt given by phi and theta changes as the vector (theta cos phi, theta sin phi),
-which is regular at zero tilt. Paths are checked in small steps, many paths at once. Each step is
-solved from the step before, so that a path keeps its branch; it must end with the readings that its
-end is commanded with.
+which is regular at zero tilt. Paths are checked in small steps, many paths at once. A step is
+solved as its pose is commanded or, where a pose has several sets of readings, from the step before,
+so that a path keeps its branch; it must end with the readings that its end is commanded with.
 
 The order of visiting comes from nearest neighbors with several first poses, each improved by
 reversing sections while that makes the path shorter (2-opt, Croes 1958,
