@@ -94,6 +94,6 @@ def test_corrected_files_bring_the_true_machine_to_its_poses(loopcal, outputs) -
     assert predicted == pytest.approx(8.2e-6, abs=0.1e-6)  # [m], of the page's two numbers
     assert after < 1.3 * predicted
     assert f"error of {after * 1e6:.2g} um" in " ".join(page.split())
-    assert f"it was {before * 1e3:.2g} mm" in " ".join(page.split())
+    assert f"(before: {before * 1e3:.2g} mm)" in " ".join(page.split())
     only_centers = measure_error(controller, truth, np.zeros(6))
     assert only_centers > 3 * after  # offsets and centers belong together
