@@ -98,7 +98,9 @@ def test_photos_become_a_measurement_file_that_calibrates(
     drawn = [[float(x), float(y)] for x, y in re.findall(r'<path d="M\S+ \S+?l(\S+) (\S+?)"', page)]
     np.testing.assert_allclose(drawn, float(times) * fitted, rtol=0.01, atol=0.6)  # [px], rounded
     loopcal("report run -o report.html")
-    assert 'id="arrow-figure' in Path("report.html").read_text("utf-8")
+    report = Path("report.html").read_text("utf-8")
+    assert 'id="arrow-figure' in report
+    assert "held-out poses of which positions or orientations" in report  # these have pixels
     loopcal(words, "--force", code=1)
     found = loopcal(f"{words} --force --json --workers 1").json
     assert [entry["pose"] for entry in found["pictures"]] == [f"p{i}" for i in range(9)]

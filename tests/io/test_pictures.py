@@ -168,9 +168,14 @@ def test_poses_are_names_of_pictures_or_rows_of_a_table(tmp_path) -> None:
     }.items():
         table.write_text(text)
         assert list(name_poses(paths, table).values()) == expected
-    for text in ("pose,q1 [mm]\na,1\nb,2\nc,3\n", "pose,picture\na,IMG_10.jpg\n"):
+    for text, named in {
+        "pose,q1 [mm]\na,1\nb,2\nc,3\n": "IMG_9.jpg has the name of none",
+        "pose,picture\na,IMG_10.jpg\n": "IMG_9.jpg",
+        # a name with a slip: the order of the rows would exchange the pictures
+        "pose,q1 [mm]\nIMG_10,1\nIMG_09,2\n": "IMG_9.jpg has the name of none",
+    }.items():
         table.write_text(text)
-        with pytest.raises(FileError):
+        with pytest.raises(FileError, match=named):
             name_poses(paths, table)
     with pytest.raises(DataError, match="Rename"):
         name_poses([Path("a.jpg"), Path("a.png")])

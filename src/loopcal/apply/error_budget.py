@@ -726,6 +726,7 @@ def _add_kinds(lines: list[SourceBudget]) -> tuple[ErrorSources, ErrorSources]:
     """Return the variances of position and orientation by kind of source."""
     sums = {name: dict.fromkeys(ErrorSources._fields, 0.0) for name in LENGTHS}
     names = {DISCREPANCY: "discrepancy", EARLIER: "earlier"}
+    names[AS_STATED] = "other" if any(line.source.kind == COMMON for line in lines) else SETUP
     for line in lines:
         kind = names.get(line.source.kind, line.source.kind)
         kind = TOLERANCES if kind.startswith(PRIOR) else kind

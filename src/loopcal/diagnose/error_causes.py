@@ -146,7 +146,8 @@ def measure_picture_errors(
 ) -> list[Finding]:
     """Return the sizes of the errors of pictures that are among the causes of residuals."""
     rows = explained.rows
-    causes = [c for c in explained.causes if c.source in (MOVED, ZOOMED, MOVING)]
+    of_pictures = (c for c in explained.causes if c.source in (MOVED, ZOOMED, MOVING))
+    causes = [c for c in of_pictures if c.p_value <= DOUBTED]
     return [] if rows is None else [_measure(linear, rows, cause) for cause in causes]
 
 
@@ -225,11 +226,8 @@ def report_picture_scale(robot: Mechanism, data: Measurements) -> list[Finding]:
     names = tuple(dict.fromkeys(kind.board for kind in boards))
     is_known = not all(any(f".{n}".endswith(f".{b}.scale_x") for n in free) for b in names)
     severity = Severity.INFO if is_known else Severity.WARNING
-    return [
-        report_finding(
-            "identifiability.board-scale", severity=severity, boards=names, is_known=is_known
-        )
-    ]
+    known: dict[str, Any] = {"boards": names, "is_known": is_known}
+    return [report_finding("identifiability.board-scale", severity=severity, **known)]
 
 
 def find_swapped_pictures(
@@ -269,8 +267,8 @@ def find_swapped_pictures(
     return findings
 
 
-# Probability of an effect of travel by noise, beside effects of the readings, above which travel is
-# not its cause.
+# Probability of an effect by noise, above which no size is stated of an error of pictures, and
+# travel, beside effects of the readings, is no cause.
 DOUBTED = 0.1
 # Measured values of a pose without which its errors have no pattern, such as single heights.
 FEWEST_VALUES = 2

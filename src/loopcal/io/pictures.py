@@ -510,8 +510,7 @@ def compare_pictures(pictures: Sequence[Picture]) -> tuple[Picture, ...]:
         elif fault is None and focal is not None:
             own = picture.focal or focal
             if abs(own / focal - 1.0) > SAME_FOCAL:
-                numbers = round(own), round(focal)
-                fault = report_finding("pictures.zoomed", focal=numbers[0], other=numbers[1])
+                fault = report_finding("pictures.zoomed", focal=round(own), other=round(focal))
         checked.append(replace(picture, fault=fault))
     return tuple(checked)
 
@@ -597,12 +596,13 @@ def name_poses(paths: Sequence[Path], names: Path | None = None) -> dict[Path, s
             raise FileError(f"the column 'picture' lacks {missing[0]!r}. Add it", names)
         return {path: listed.get(path.name) or listed[path.stem] for path in paths}
     unique = list(dict.fromkeys(poses))
-    if all(path.stem in unique for path in paths):
+    others = [path.name for path in paths if path.stem not in unique]
+    if not others:
         return {path: path.stem for path in paths}
-    if len(unique) != len(paths):
+    if len(unique) != len(paths) or len(others) < len(paths):
         sentence = (
-            f"there are {len(paths)} pictures, but {len(unique)} poses, so their order assigns "
-            "none. Name the pictures like the poses, or add the column 'picture'"
+            f"{len(paths)} pictures and {len(unique)} poses, but {others[0]} has the name of none. "
+            "Name all pictures like the poses, or none of as many, or add the column 'picture'"
         )
         raise FileError(sentence, names)
     return dict(zip(paths, unique, strict=True))

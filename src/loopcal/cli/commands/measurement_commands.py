@@ -644,10 +644,9 @@ def photos(
         for p in pictures
     ]
     document = {"measurements": output, "sheet": page_file, "used": len(used), "pictures": shown}
-    lines = [f"{picture.path.name}: {of.describe_picture(picture)}" for picture in pictures]
     files = [] if beside else ["poses.csv"]
     page = [
-        "\n".join(lines),
+        "\n".join(f"{p.path.name}: {of.describe_picture(p)}" for p in pictures),
         f"{output}: {len(used)} of {len(pictures)} pictures, {page_file} shows them",
         suggest_command("calibrate", "ROBOT", *files, output, "-o", "run"),
     ]

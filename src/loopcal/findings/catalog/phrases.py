@@ -98,7 +98,7 @@ SOURCES = {
     "earlier": "earlier calibration",
     "repeatability": "repeatability in use",
     "discrepancy": "model discrepancy",
-    "other": "other errors that the residuals show",
+    "other": "other errors",
 }
 """Source of an expected error -> words."""
 
