@@ -446,7 +446,7 @@ class Image(Kind):
     def possible_setup(self) -> Mapping[str, setup.SetupItem]:
         """The poses of camera and board, the lens, and the print."""
         lens, ratio, flat = self.lens or self.camera, Dimension.RATIO, np.zeros(3)
-        stated = dict(zip(LENS, self.nominal_lens[:, None], strict=True))
+        stated: Mapping[str, FloatArray] = dict(zip(LENS, self.nominal_lens[:, None], strict=True))
         numbers: dict[str, list[tuple[str, Sequence[str], Dimension, FloatArray]]] = {
             item: [(lens, [n], Dimension.PIXEL if n in PIXELS else ratio, stated[n]) for n in names]
             for item, names in LENS_ITEMS.items()

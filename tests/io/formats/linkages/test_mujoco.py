@@ -58,6 +58,7 @@ def close_by_mujoco(text: str, motors: dict[str, float]) -> np.ndarray:
         joint = model.joint(name)
         data.qpos[joint.qposadr[0]] += value
         passive[joint.dofadr[0]] = False
+    gap = np.array([np.inf])
     for _ in range(60):
         mujoco.mj_fwdPosition(model, data)
         gap = np.array(data.efc_pos[: data.ne])
