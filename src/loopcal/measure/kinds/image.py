@@ -21,7 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import ClassVar, NamedTuple, Self
 
 import numpy as np
@@ -601,8 +601,9 @@ class Image(Kind):
     # Start values.
 
     def list_pictures(self, T: FloatArray, measured: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the poses (n, 4, 4) and pixels (n, corners, 2) of pictures, NaN where absent, from
-        rows of any order: rows of one pose, and of two pictures where a corner occurs twice.
+        """Return the poses (n, 4, 4) and pixels (n, corners, 2) of pictures, NaN where absent, in
+        the order of their first rows: rows of one pose, and of two pictures where a corner occurs
+        twice.
         """
         _, of_pose = np.unique(T.reshape(len(T), -1), axis=0, return_inverse=True)
         corner = measured[:, 0].astype(np.intp)
@@ -610,15 +611,12 @@ class Image(Kind):
         order = np.argsort(key, kind="stable")
         again = np.zeros(len(key), dtype=np.intp)
         again[order] = np.arange(len(key)) - np.searchsorted(key[order], key[order])
-        _, first, picture = np.unique(
-            np.column_stack([of_pose.ravel(), again]),
-            axis=0,
-            return_index=True,
-            return_inverse=True,
-        )
+        shown = np.column_stack([of_pose.ravel(), again])
+        _, first, picture = np.unique(shown, axis=0, return_index=True, return_inverse=True)
         pixels = np.full((len(first), self.rows_per_pose, 2), np.nan)
         pixels[picture.ravel(), corner] = measured[:, 1:]
-        return T[first], pixels
+        order = np.argsort(first)
+        return T[first[order]], pixels[order]
 
     def guess_values(self, T: FloatArray, measured: FloatArray) -> FloatArray:
         """Return the lens by Zhang's closed form and all pictures, the board in each picture, and
@@ -632,34 +630,10 @@ class Image(Kind):
         T, pixels = T[chosen], pixels[chosen]
         candidates = [
             self.assemble_values(of_lens | of_frames)
-            for of_lens, poses in self._guess_lenses(pixels)
+            for of_lens, poses in _guess_lenses(self, pixels.tobytes())
             for of_frames in self._guess_frames(T, poses)
         ]
         return np.concatenate(candidates)
-
-    def _guess_lenses(self, pixels: FloatArray) -> list[tuple[dict[str, FloatArray], FloatArray]]:
-        """Return values of the items of the lens, and T_camera_board (n, 4, 4) with each."""
-        points = self._stated_points
-        lens, free = self.nominal_lens, np.zeros(len(LENS), dtype=bool)
-        found = [(lens, locate_boards(points, pixels, lens))]
-        for item in (item for item in LENS_ITEMS if item in self.unknown):
-            free |= np.isin(LENS, LENS_ITEMS[item])
-        starts = [lens] if free.any() else []
-        if "focal" in self.unknown:
-            focal = solve_focal_lengths(points, pixels, lens[2:4])
-            if focal is not None:
-                closed = np.concatenate([focal, lens[2:]])
-                starts.append(closed)
-                found.append((closed, locate_boards(points, pixels, closed)))
-        for start in starts:
-            fit = calibrate_camera(points, pixels, start, free)
-            if not (fit.sd[2:4] < CENTER_SD * max(self.size)).all():  # as if a board never turns
-                fit = calibrate_camera(points, pixels, start, free & ~np.isin(LENS, VAGUE))
-            # pictures that do not determine a lens leave it anywhere
-            if np.isfinite(fit.lens).all() and list_focal_lengths(fit.lens).min() > 0.0:
-                found.append((fit.lens, fit.poses))
-        items = {name: [LENS.index(n) for n in names] for name, names in LENS_ITEMS.items()}
-        return [({name: of[i] for name, i in items.items()}, poses) for of, poses in found]
 
     def _guess_frames(self, T: FloatArray, poses: FloatArray) -> list[dict[str, FloatArray]]:
         """Return values of camera and board, from T_base_platform and T_camera_board (n, 4, 4)."""
@@ -692,6 +666,34 @@ class Image(Kind):
             }
             for frame, tool in pairs
         ]
+
+
+# A search for conventions guesses the lens of the same pictures with many sets of readings.
+@lru_cache(maxsize=8)
+def _guess_lenses(camera: Image, seen: bytes) -> list[tuple[dict[str, FloatArray], FloatArray]]:
+    """Return values of the items of the lens, and T_camera_board (n, 4, 4) with each, of pictures:
+    `seen` has the doubles of their pixels (n, corners, 2).
+    """
+    points, pixels = camera._stated_points, np.frombuffer(seen).reshape(-1, camera.rows_per_pose, 2)
+    lens, free = camera.nominal_lens, np.zeros(len(LENS), dtype=bool)
+    found = [(lens, locate_boards(points, pixels, lens))]
+    for item in (item for item in LENS_ITEMS if item in camera.unknown):
+        free |= np.isin(LENS, LENS_ITEMS[item])
+    starts = [lens] if free.any() else []
+    focal = solve_focal_lengths(points, pixels, lens[2:4]) if "focal" in camera.unknown else None
+    if focal is not None:
+        closed = np.concatenate([focal, lens[2:]])
+        starts.append(closed)
+        found.append((closed, locate_boards(points, pixels, closed)))
+    for start in starts:
+        fit = calibrate_camera(points, pixels, start, free)
+        if not (fit.sd[2:4] < CENTER_SD * max(camera.size)).all():  # as if a board never turns
+            fit = calibrate_camera(points, pixels, start, free & ~np.isin(LENS, VAGUE))
+        # pictures that do not determine a lens leave it anywhere
+        if np.isfinite(fit.lens).all() and list_focal_lengths(fit.lens).min() > 0.0:
+            found.append((fit.lens, fit.poses))
+    items = {name: [LENS.index(n) for n in names] for name, names in LENS_ITEMS.items()}
+    return [({name: of[i] for name, i in items.items()}, poses) for of, poses in found]
 
 
 def state_camera(
