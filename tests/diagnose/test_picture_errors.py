@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from loopcal import calibrate, geometry, identifiability, identify, load_robot
+from loopcal.diagnose.conventions.convention_check import compare_conventions
 from loopcal.diagnose.error_causes import (
     explain_residuals,
     find_print_scale,
@@ -194,3 +195,27 @@ def test_calibration_names_swapped_pictures() -> None:
     report = calibrate(*change(swap))
     found = [f.data["shown"] for f in report.findings if f.code == "outliers.swapped-picture"]
     assert found == ["12", "5"]
+
+
+@pytest.mark.slow
+def test_readings_of_the_row_above_are_named() -> None:
+    """The first pose then has the readings of the last one, which misleads the start values."""
+    robot, rng = load_robot("linear-delta"), np.random.default_rng(2)
+    kind = Image(
+        T_camera=geometry.make_pose(
+            geometry.exp_so3(np.array([np.pi + 0.6, 0.0, 0.0])), np.array([0.0, -0.4, 0.72])
+        ),
+        T_board=geometry.make_pose(np.diag([1.0, -1.0, -1.0]), np.array([-0.036, 0.024, 0.0])),
+        focal=(4000.0, 4000.0),
+        corners=(7, 5),
+        square=0.012,
+        unknown=("camera", "board", "focal", "center", "radial", "tangential"),
+    )
+    instrument = Instrument((Sensor(kind, Gaussian(np.full(2, SIGMA))),))
+    poses = rng.uniform([-0.06, -0.06, 0.0], [0.06, 0.06, 0.25], (25, 3))
+    poses = poses[np.argsort(poses[:, 2])]  # as along a path
+    data = simulate_trials(robot, sample_truth(robot, 1, 4), poses, instrument, 5).trial(0)
+    shifted = replace(data, readings=np.roll(data.readings, -1, axis=0))
+    finding = compare_conventions(robot, shifted).finding
+    assert finding is not None
+    assert "readings taken from the row above" in str(finding)

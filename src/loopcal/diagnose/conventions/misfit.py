@@ -870,15 +870,15 @@ def _drop_same(
 
 
 def _select_few(data: Measurements) -> IntArray:
-    """Return poses spread over the data by which many interpretations are compared; all where rows
-    share more than their pose.
+    """Return poses spread over the data by which many interpretations are compared, without the
+    ends, one of which shifted readings leave wrong; all where rows share more than their pose.
     """
     n = data.n_poses
     equations = sum(o.whitener.shape[-1] * len(o) for o in data.observations)
     count = max(FEWEST_POSES, -(-FEW_ROWS * n // max(equations, 1)))
-    if n <= count or shares_poses(data):
+    if n < count + 2 or shares_poses(data):
         return np.arange(n)
-    return choose_evenly(n, count)
+    return 1 + choose_evenly(n - 2, count)
 
 
 # Data that another interpretation explains as well as the stated one cannot show which is true.
