@@ -210,6 +210,20 @@ def test_file_of_two_cameras_assigns_rows_by_the_columns_camera_and_board(tmp_pa
         load_measurements(path, robot)
 
 
+def test_a_bent_board_is_found_with_the_machine() -> None:
+    robot = load_robot("hexapod-42")
+    truth = robot.with_values(sample_truth(robot, 1, 2)[0])
+    kind = make_kind(unknown=("camera", "board", "focal", "center", "bend"))
+    instrument = Instrument((Sensor(kind, Gaussian(np.full(2, 0.1))),))
+    bend = {"board.bend_x": 8e-4, "board.bend_y": -5e-4, "board.bend_xy": 3e-4}  # [m]
+    fit = identify(robot, simulate(truth, make_poses(24), instrument, 3, nuisance_values=bend))
+    assert fit.converged
+    places = [fit.nuisance.names.index(name) for name in bend]
+    sd = fit.nuisance.sd[places]
+    assert (sd < 2e-5).all()
+    assert (np.abs(fit.nuisance.estimate[places] - list(bend.values())) < 4.0 * sd).all()
+
+
 @pytest.mark.slow
 def test_two_cameras_with_one_lens_and_a_board_each_calibrate_a_machine(tmp_path) -> None:
     """A sheet with two kinds, from simulated pictures to parameters, frames and the shared lens."""
