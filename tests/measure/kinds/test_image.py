@@ -17,7 +17,7 @@ from loopcal.measure.kinds.image import (
     find_rays,
     locate_boards,
     project,
-    solve_focal_lengths,
+    solve_focal_length,
 )
 from loopcal.measure.simulation import sample_truth, simulate
 
@@ -82,13 +82,13 @@ def test_focal_lengths_follow_in_closed_form_without_distortion() -> None:
     lens = np.where(np.arange(9) < 4, LENS_VALUES, 0.0)
     x = (poses[:, None, :3, :3] @ BOARD[..., None])[..., 0] + poses[:, None, :3, 3]
     pixels = project(x, lens)[0]
-    focal = solve_focal_lengths(BOARD, pixels, lens[2:4])
+    focal = solve_focal_length(BOARD, pixels, lens[2:4])
     assert focal is not None
     np.testing.assert_allclose(focal, lens[:2], rtol=1e-8)
     for place in np.random.default_rng(1).uniform([-0.1, -0.1, 0.4], [0.1, 0.1, 0.6], (20, 3)):
         level = np.tile(geometry.make_pose(np.eye(3), place), (4, 1, 1))
         x = (level[:, None, :3, :3] @ BOARD[..., None])[..., 0] + level[:, None, :3, 3]
-        assert solve_focal_lengths(BOARD, project(x, lens)[0], lens[2:4]) is None
+        assert solve_focal_length(BOARD, project(x, lens)[0], lens[2:4]) is None
 
 
 @pytest.mark.slow
@@ -121,6 +121,12 @@ def test_board_that_never_turns_leaves_the_center_in_the_middle() -> None:
         names = [parameter.name for parameter in kind.nuisance_parameters]
         center = guesses[:, [names.index("camera.cx"), names.index("camera.cy")]]
         assert np.abs(center - [1999.5, 1499.5]).max() < 300.0  # [px]
+
+
+@pytest.mark.parametrize("focal", [(0.0, 3000.0), (3000.0, 0.0), (-1.0, 1.0), (3000.0, np.nan)])
+def test_a_focal_length_that_is_none_is_refused(focal) -> None:
+    with pytest.raises(DataError, match="the focal length must be above 0"):
+        Image(focal=focal)
 
 
 def test_pictures_with_too_few_corners_are_refused() -> None:

@@ -166,7 +166,7 @@ def solve_homography(flat: FloatArray, image: FloatArray) -> FloatArray:
     return np.linalg.solve(normal[1], H @ normal[0])
 
 
-def solve_focal_lengths(
+def solve_focal_length(
     points: FloatArray, pixels: FloatArray, center: FloatArray
 ) -> FloatArray | None:
     """Return fx and aspect (2,) from pictures (n, k, 2) of points (k, 3) and the center (2,); None
@@ -260,7 +260,7 @@ def calibrate_camera(
         )
     present = find_present(pixels)
     if np.isnan(lens[:2]).any():
-        focal = solve_focal_lengths(points, pixels, lens[2:4])
+        focal = solve_focal_length(points, pixels, lens[2:4])
         if focal is None:
             raise DataError(
                 "the pictures do not determine the focal length. Tilt the board by 30 deg in some, "
@@ -396,7 +396,7 @@ class Image(Kind):
                 f"a board of {self.corners[0]} x {self.corners[1]} corners at {self.square} m. "
                 "Give at least 2 columns and rows of corners, at a distance above 0"
             )
-        if min(self.size) < 1 or not min(list_focal_lengths(self.nominal_lens)) > 0.0:
+        if min(self.size) < 1 or not all(f > 0.0 for f in self.focal or ()):
             raise DataError("the size of a picture and the focal length must be above 0")
 
     @classmethod
@@ -680,7 +680,7 @@ def _guess_lenses(camera: Image, seen: bytes) -> list[tuple[dict[str, FloatArray
     for item in (item for item in LENS_ITEMS if item in camera.unknown):
         free |= np.isin(LENS, LENS_ITEMS[item])
     starts = [lens] if free.any() else []
-    focal = solve_focal_lengths(points, pixels, lens[2:4]) if "focal" in camera.unknown else None
+    focal = solve_focal_length(points, pixels, lens[2:4]) if "focal" in camera.unknown else None
     if focal is not None:
         closed = np.concatenate([focal, lens[2:]])
         starts.append(closed)
