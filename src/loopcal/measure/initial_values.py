@@ -386,9 +386,7 @@ def _collect_candidates(
     open may do for the others: without a closed form, frames are spread unless this `is_strict`.
     """
     offered, own = [], kind.without_shared_errors() if kind.shared_errors else kind
-    given = poses, measured, is_row
-    sets = own.guess_sets(*given, worth) if isinstance(own, Position) else own.guess_sets(*given)
-    for guesses in sets:
+    for guesses in own.guess_sets(poses, measured, is_row, worth):
         if not isinstance(guesses, DataError):
             shared = len(kind.nominal_values) - guesses.shape[1]  # a bias or drift begins at zero
             candidates = np.concatenate([guesses, np.zeros((len(guesses), shared))], axis=1)

@@ -515,11 +515,12 @@ class Kind(ABC):
         return self.nominal_values[None]
 
     def guess_sets(
-        self, T: FloatArray, measured: FloatArray, is_row: BoolArray
+        self, T: FloatArray, measured: FloatArray, is_row: BoolArray, worth: float = np.inf
     ) -> list[FloatArray | DataError]:
         """Return the candidates (k, u) of `guess_values` for s sets of rows with parameters of
         their own, or why there are none, from poses T (s | 1, r, 4, 4) and columns (s, r, c) of
-        those that a set has, `is_row` (s | 1, r).
+        those that a set has, `is_row` (s | 1, r). Candidates that are known to have more than
+        `worth` times the lowest sum of squares may be left out.
         """
         guesses: list[FloatArray | DataError] = []
         for j, of_set in enumerate(measured):

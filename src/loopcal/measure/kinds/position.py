@@ -335,7 +335,7 @@ class Position(TargetKind):
         see `geometry.solve_frame_and_points`.
         """
         if self.is_of_base or not {"frame", "targets"} <= set(self.unknown):
-            return super().guess_sets(T, measured, is_row)
+            return super().guess_sets(T, measured, is_row, worth)
         (s, r), k = measured.shape[:2], len(self.targets)
         positions = np.where(is_row[..., None], measured, np.nan).reshape(s, r * k, 3)
         guesses: list[FloatArray | DataError] = [self.nominal_values[None]] * s
