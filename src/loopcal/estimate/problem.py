@@ -322,29 +322,14 @@ class Problem:
         are_shared = poses.is_kept and poses.coordinates.are_shared
         if are_shared and t > 1 and (deviation == deviation[0]).all():
             known = poses.solve_exact_poses(deviation[:1], start, not folds)
-        # the elimination tells whether nuisance parameters are the best ones, and its step leads to
-        # those: mostly, the search for them is not needed
-        is_plain = t == 1 and poses.is_kept and not poses.coordinates.count
-        tries = 3 if is_plain and self.nuisance is not None and self.consistent is None else 0
         batch, linearizations = self.part_size, []
         for first in range(0, t, batch):
             chosen = np.arange(first, min(first + batch, t))
             z, trials, begin = deviation[chosen], self.trials[chosen], start.take(chosen)
-            solution, fixed = known, begin.predict_nuisance(z) if tries else None
-            before = np.full(1, np.inf)
-            while True:
-                at = z, trials, begin, self.control, fixed, solution
-                solution = poses.solve(*at, derivatives=not folds)
-                part = self.take(chosen).linearize_at(z, begin, solution)
-                if fixed is None or part.nuisance is None:
-                    break
-                gain = part.nuisance.elimination.explained
-                cost, tries = part.cost + gain, tries - 1
-                if np.isfinite(cost).all() and self.control.is_negligible(gain, cost).all():
-                    break
-                is_over = not tries or self.control.is_worse(cost, before).any()
-                fixed, before = None if is_over else part.nuisance.best, cost
-            linearizations.append(part)
+            solution = poses.solve(
+                z, trials, begin, self.control, known=known, derivatives=not folds
+            )
+            linearizations.append(self.take(chosen).linearize_at(z, begin, solution))
         return Linearization.join(linearizations)
 
     def advance(
