@@ -88,13 +88,14 @@ def minimize_by_halving(
     """
     stuck = ~np.isfinite(point.cost)
     converged = np.zeros(len(point.cost), dtype=bool)
+    last = np.inf  # share of the step before: along a curved valley the next one is as long
     for _ in range(control.steps):
         step = propose(point)
         converged = control.is_negligible(step.change, point.cost)
         if (converged | stuck).all():
             break
         active = ~converged & ~stuck
-        share = np.where(active[:, None], step.share, 0.0)
+        share = np.where(active[:, None], np.minimum(step.share, 2.0 * last), 0.0)
         candidate = point
         for attempt in range(control.attempts + 1):
             candidate = move(point, step, share)
@@ -112,7 +113,7 @@ def minimize_by_halving(
             gained = point.cost - candidate.cost
             promised = step.change > control.stuck * point.cost
             stuck |= promised & ~(gained > control.stuck * step.change)
-        point = candidate
+        point, last = candidate, np.where(share > 0.0, share, np.inf)
         if not share.any():
             break
     return point, converged
