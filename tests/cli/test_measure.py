@@ -342,8 +342,10 @@ def test_a_killed_command_loses_no_row(measure, rows) -> None:
             process.stdin.write((join(row) + "\n").encode())
         process.stdin.flush()
         asked = 0
-        while asked < 5:  # it asks for the fifth row when four are on the disk
-            asked += process.stdout.readline().startswith(b"Command pose")
+        for line in process.stdout:  # it asks for the fifth row when four are on the disk
+            asked += line.startswith(b"Command pose")
+            if asked == 5:
+                break
         os.kill(process.pid, signal.SIGKILL)
     measure([], "resumed with 4 rows, 4 of them in use")
     assert read_used() == [row[0] for row in rows[:4]]

@@ -199,12 +199,31 @@ def test_a_wrong_row_before_anything_could_be_tested_is_found_later() -> None:
     assert machine.task.labels[machine.fit[0]] in verdict.findings[0].data["suspects"]
 
 
+def test_a_wrong_first_row_that_the_unknown_frame_hid_is_no_drift() -> None:
+    """All other rows contradict it when its pose comes again."""
+    machine = Machine("linear-delta", ("base",), 1, goal=4.5e-6, target="position")
+    poses, state, said = list[int](), co.Companion(machine.task), list[str]()
+    while (pose := co.choose_next(state).pose) in machine.fit:
+        poses.append(pose)
+        measured = machine.measure(poses, {0: (-3.5e-5, 0.0, 0.0)})
+        verdict = co.examine_row(state, measured, pose)
+        state = co.take_rows(machine.task, measured, poses, verdict.is_used, state)
+        said.append(verdict.judgement)
+    assert said[:2] == ["untestable", "fits"]
+    assert "moved" not in said
+    assert state.is_used.tolist().index(True) == 1
+    assert state.pending == ()
+
+
 def test_a_check_pose_tells_a_drift() -> None:
     machine = make_machine()
     drift: Wrong = {10: (8e-05, 0.0, 0.0), 11: (8e-05, 0.0, 0.0)}
     poses = [*machine.fit[:10], machine.fit[0], machine.fit[0]]
     verdicts = follow(machine, poses, drift)[1]
     assert [verdict.judgement for verdict in verdicts[10:]] == ["repeat", "moved"]
+    doubted = follow(machine, poses[:11], drift)[0]
+    following = co.choose_next(doubted)
+    assert (following.reason, following.pose) == ("repeat", machine.fit[0])
     assert verdicts[-1].findings[0].data["between"] == 11
     assert verdicts[-1].findings[0].data["difference"].value == pytest.approx(0.08, abs=0.02)
 

@@ -396,8 +396,9 @@ class Companion:
 
     @property
     def pending(self) -> tuple[int, ...]:
-        """Places in the sheet of poses whose rows did not fit, and that have none that does."""
-        return tuple(dict.fromkeys(pose for pose in self.poses if pose not in self.used))
+        """Places in the sheet of poses whose last row is not used."""
+        is_last_used = dict(zip(self.poses, self.is_used, strict=True))
+        return tuple(pose for pose in is_last_used if not is_last_used[pose])
 
 
 def examine_row(before: Companion, measured: Measurements, pose: int) -> Verdict:
@@ -423,7 +424,10 @@ def examine_row(before: Companion, measured: Measurements, pose: int) -> Verdict
         finding = report_finding(f"companion.{judgement}", **data, **more)
         return Verdict(judgement, prediction, expected, used, (finding,))
 
-    def conclude_drift(since: int) -> Verdict:
+    def conclude_drift(since: int, new: list[int]) -> Verdict:
+        if find_suspects(fit, fitted, new) == [since]:  # all other rows contradict it, too
+            without = before.is_used & (np.arange(n - 1) != since)
+            return examine_row(replace(before, is_used=without), measured, pose)
         change = rows.raw[since, :, -1] - rows.raw[-1, :, -1]
         sd = fit.scale[0] * np.sqrt(np.diagonal(rows.covariance[since] + rows.covariance[-1]))
         moved = prediction._replace(difference=change, sd=sd)
@@ -434,7 +438,7 @@ def examine_row(before: Companion, measured: Measurements, pose: int) -> Verdict
         used[-1] = True
         earlier = [i for i in same if before.is_used[i]]
         if earlier and compare_visits(rows, earlier[0], n - 1, fit.scale) < LEVEL:
-            return conclude_drift(earlier[0])
+            return conclude_drift(earlier[0], [n - 1])
         if prediction.degrees == 0:
             names = measured.nuisance_parameters.table.names
             is_open = fit.solution.open[: len(names)].any(axis=1)
@@ -450,7 +454,7 @@ def examine_row(before: Companion, measured: Measurements, pose: int) -> Verdict
     apart = [i for i in same if before.is_used[i] and i not in agreeing]
     if apart:
         used[apart] = True  # it was right then
-        return conclude_drift(apart[0])
+        return conclude_drift(apart[0], [*agreeing, n - 1])
     suspects = find_suspects(fit, fitted, [*agreeing, n - 1])
     if len(suspects) == 1:
         used[suspects] = False
@@ -592,15 +596,13 @@ class NextPose:
     reason : "chosen" by the operator, "repeat" a row that did not fit, "check" for drift, "best" by
         gain per minute, "again" because the sheet has no other pose, "validate" with a held-out
         pose, or "done".
-    pose : place in the sheet; None where nothing is left. via_home : whether the straight path from
-        the last pose is not allowed.
+    pose : place in the sheet; None where nothing is left.
     left : number of fit poses to the goal, or of the sheet without a goal; None where MOST_REPEATS
         more do not reach it. held_out : number that is not measured. minutes : of both, if known.
     """
 
     reason: Reason
     pose: int | None
-    via_home: bool
     left: int | None
     held_out: int
     minutes: float | None
@@ -654,11 +656,7 @@ def choose_next(
         reason, pose = "best" if going[0] in free else "again", going[0]
     elif validating:
         reason, pose = "validate", min(validating, key=lambda i: minutes[i])
-    via_home = False
-    if pose is not None and companion.poses:
-        straight = check_paths(problem.candidates.checker, here[None], at[pose][None])
-        via_home = not straight.allowed[0]
-    return NextPose(reason, pose, via_home, left, len(validating), total)
+    return NextPose(reason, pose, left, len(validating), total)
 
 
 def order_by_gain(
@@ -692,7 +690,9 @@ def order_by_gain(
 
 
 def report_progress(companion: Companion, following: NextPose) -> tuple[Finding, ...]:
-    """Return the accuracy so far, what is left to the goal, and what to measure next."""
+    """Return the accuracy so far, what is left to the goal, what to measure next, and whether the
+    straight path to it is not allowed.
+    """
     task, options = companion.task, companion.task.problem.options
     errors, findings = predict_accuracy(companion), list[Finding]()
     if companion.scale > 1.0:
@@ -702,13 +702,17 @@ def report_progress(companion: Companion, following: NextPose) -> tuple[Finding,
     else:
         shown = errors.to_quantities(task.robot)
         findings.append(report_finding("companion.accuracy", share=errors.share, errors=shown))
-    goal, label, left = None, "", following.left
+    goal, label, left, via_home = None, "", following.left, False
     if options.goal is not None:
         goal = task.robot.to_quantity(options.goal, DIMENSIONS[options.target])
     if following.pose is not None:
-        label = task.labels[following.pose]
+        label, candidates = task.labels[following.pose], task.problem.candidates
+        if companion.poses:
+            ends = candidates.coordinates[[companion.poses[-1], following.pose]]
+            via_home = not check_paths(candidates.checker, ends[:1], ends[1:]).allowed[0]
     code = "goal-far" if left is None else "left" if left else "enough"
-    facts = {**vars(following), "goal": goal, "pose": label, "repeats": MOST_REPEATS}
+    facts = {**vars(following), "goal": goal, "pose": label, "via_home": via_home}
+    facts["repeats"] = MOST_REPEATS
     codes = (code, "next") if label else (code,)
     findings += [report_finding(f"companion.{code}", **facts) for code in codes]
     return tuple(findings)
