@@ -37,13 +37,13 @@ class Step:
 
 
 @pytest.mark.parametrize("steepness", [10.0, 100.0])
-def test_a_curved_valley_takes_hardly_more_than_two_trials_a_step(steepness):
+def test_a_curved_valley_takes_two_trials_a_step(steepness):
     tried = []
 
     def propose(point: Point) -> Step:
         x, jacobian = point.at[:, 0], np.zeros((len(point.at), 2, 2))
         jacobian[:, 0, 0], jacobian[:, 0, 1], jacobian[:, 1, 0] = -2 * steepness * x, steepness, -1
-        by = -np.linalg.solve(jacobian, point.residuals[..., None])[..., 0]
+        by = -np.matmul(np.linalg.inv(jacobian), point.residuals[..., None])[..., 0]
         tried.append(0)
         return Step(by, point.cost, np.ones((len(x), 1)))  # two residuals, two unknowns
 
