@@ -18,6 +18,7 @@ from loopcal.apply.compensation import compensate
 from loopcal.diagnose import bootstrap
 from loopcal.diagnose.bootstrap import Clusters, choose_clusters, compute_robust_spread
 from loopcal.diagnose.residual_patterns import ResidualRows
+from loopcal.diagnose.row_errors import PosePredictions
 from loopcal.estimate.fit_linearization import linearize_fit
 from loopcal.estimate.identification import identify
 from loopcal.estimate.observation_rows import list_block_labels
@@ -28,6 +29,7 @@ from loopcal.io.robot.robot_file import load_robot
 from loopcal.io.runs.result_files import format_compensation, load_targets
 from loopcal.measure.measurements import Measurements
 from loopcal.mechanism.solutions import forward
+from loopcal.numerics.elimination import UnknownRoot
 from loopcal.report.calibration_view import view_compensation
 from tests.diagnose.correlated_data import ROBOTS, draw_errors, make_rows, measure
 
@@ -228,3 +230,21 @@ def test_an_even_choice_of_clusters_stands_for_all(monkeypatch) -> None:
     for each in (ratio, all_ratio):
         assert abs(each.ratio**2 - 1.0) < 4.0 * math.sqrt(2.0 / each.degrees)
         assert each.p_value > 1e-3
+
+
+def test_predictions_of_many_targets_need_no_derivatives_of_all_rows_by_all_targets() -> None:
+    robot = load_robot("hexapod-42")
+    data = draw_sessions(robot, 80, 20, 40)
+    setup, T = data.nuisance_parameters, forward(robot, data.readings).T[None]
+    kept = frozenset(setup.table.names)
+    prediction = PosePredictions(T, {}, setup, setup.values()[None], kept)
+    root = UnknownRoot(np.arange(len(setup))[:, None], np.full((len(setup), 1), 1e-6), len(setup))
+    tracemalloc.start()
+    try:
+        prediction.residuals(data.observations)
+        prediction.setup_deviations(data.observations, root)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    dense = 8 * data.n_rows * setup.indices[0].shape[1]
+    assert peak < dense  # half of it; with all derivatives four times as much

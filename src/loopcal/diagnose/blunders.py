@@ -55,14 +55,14 @@ ANYWHERE = 1e3
 
 class BlockRows(NamedTuple):
     """Rows of b held-out blocks of equal size in nodes of one structure, -1 without any, by what
-    predicts them: independent standard normal variables, those of the nodes' paths first.
+    predicts them: independent standard normal variables, those of the nodes' paths first, and the
+    residuals last.
     """
 
     structure: int
     blocks: IntArray  # (b,) their numbers
     nodes: IntArray  # (b,)
-    rows: FloatArray  # (b, m, w + k)
-    residual: FloatArray  # (b, m)
+    rows: FloatArray  # (b, m, w + k + 1)
     present: BoolArray  # (b, m)
 
 
@@ -102,15 +102,14 @@ class HeldOutBlocks(NamedTuple):
         (u,), and of others.
         """
         influence, (done, triangle, y) = outliers.make_empty_influence(len(self.poses)), prediction
-        for structure, numbers, nodes, rows, r, present in self.groups:
-            w = rows.shape[2] - self.shared
-            own, half, at_best = rows[..., :w], rows[..., w:], r
+        for structure, numbers, nodes, rows, present in self.groups:
+            own, half, r = np.split(rows, [rows.shape[2] - self.shared - 1, -1], axis=2)
             if done is not None and structure >= 0:
                 path, root, slope = done.at_nodes(nodes)
                 half = half + own @ slope
-                at_best = r + (own @ done.shift[0, path][..., None])[..., 0]
+                r = r + own @ done.shift[0, path][..., None]
                 own = own @ root
-            at_best = at_best + half @ y
+            at_best = r[..., 0] + half @ y
             if half.size:  # one system for all blocks
                 stacked = half.reshape(-1, half.shape[2]).T
                 half = substitute_transposed(triangle, stacked).T.reshape(half.shape)
@@ -123,7 +122,7 @@ class HeldOutBlocks(NamedTuple):
 
     def combine(self, excluded: BoolArray) -> Prediction:
         """Return the prediction by the blocks that are not excluded."""
-        k, factors = self.shared, NodeFactors(self.tree, 1, self.shared)
+        k, factors = self.shared, NodeFactors(self.tree, 1, self.shared, np.inf)
         for i, structure in enumerate(self.tree.structures):  # of variance 1
             n, u = structure.unknowns.shape
             unit, rest = np.eye(u, structure.width), np.zeros((1, n, u, k + 1))
@@ -131,11 +130,10 @@ class HeldOutBlocks(NamedTuple):
             factors.add(engine.BlockRows(i, np.arange(n), use_path(structure, n), rows, rest))
         factor = np.eye(k + 1)[None]
         factor[0, k, k] = 0.0
-        for structure, numbers, nodes, rows, residual, _ in self.groups:
+        for structure, numbers, nodes, rows, _ in self.groups:
             kept = ~excluded[numbers]
-            all_rows = np.concatenate([rows[kept], residual[kept][..., None]], axis=2)
-            own = structure, nodes[kept], numbers[kept], all_rows[None]
-            part = NodeRows.divide(self.tree, *own)
+            own = nodes[kept], numbers[kept], (rows if kept.all() else rows[kept])[None]
+            part = NodeRows.divide(self.tree, structure, *own)
             factor = fold_node_rows(factor, factors, [part] if kept.any() else [])
         done = None
         if self.tree.structures:
@@ -200,7 +198,8 @@ class Predictor(NamedTuple):
             used = np.where(unknowns[..., None] >= 0, variables[unknowns], -1)
             moved, to_own = outliers.join_columns(used, root[unknowns])
             shared = own @ by_shared[unknowns] + machine @ by_shared[len(table.names) :]
-            parts.append((blocks, moved, own @ to_own, shared, r, present))
+            right = np.concatenate([shared, r[..., None]], axis=2)
+            parts.append((blocks, moved, own @ to_own, right, present))
         if tree is None:
             tree = _build_tree([moved for _, moved, *_ in parts], self._count_own())
         groups = list[BlockRows]()
@@ -308,7 +307,7 @@ def _build_tree(moved: Sequence[IntArray], count: int) -> EliminationTree:
 
 def _divide(
     tree: EliminationTree, blocks: IntArray, moved: IntArray, rows: FloatArray,
-    shared: FloatArray, residual: FloatArray, present: BoolArray,
+    right: FloatArray, present: BoolArray,
 ) -> list[BlockRows]:  # fmt: skip
     """Return the rows of blocks by the structure of their nodes; arguments as in `make_blocks`."""
     node = np.where(moved >= 0, tree.node[moved], -1).max(axis=1, initial=-1)
@@ -321,8 +320,8 @@ def _divide(
             width = tree.structures[s].width
             columns = np.where(moved[own] >= 0, tree.columns(node[own], moved[own]), width)
             spread = spread_columns(rows[own], columns, width)
-        both = np.concatenate([spread, shared[own]], axis=2)
-        groups.append(BlockRows(s, blocks[own], node[own], both, residual[own], present[own]))
+        both = np.concatenate([spread, right[own]], axis=2)
+        groups.append(BlockRows(s, blocks[own], node[own], both, present[own]))
     return groups
 
 

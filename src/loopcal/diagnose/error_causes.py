@@ -353,11 +353,14 @@ def list_drive_effects(linear: FitLinearization, rows: ResidualRows) -> list[Eff
     readings = linear.data.readings[None]
     S = differentiate_pose(robot, robot.values[None], readings, states.state).readings[0]
     values, places = np.zeros((len(rows.residual), S.shape[-1])), rows.locate_poses(linear.data)
+    trials, same = np.zeros(1, np.int64), np.arange(len(S))
     for number, r in enumerate(kinds):
-        evaluated, white = evaluate_rows(r, poses, np.zeros(1, np.int64), linear.solution.nuisance)
-        Z = r.whiten_columns(white, evaluated.jacobian)[0] @ S[r.poses]
         own = rows.kind == number
-        values[own] = Z[rows.row[own], rows.column[own]]
+        chosen, row = np.unique(rows.row[own], return_inverse=True)
+        few = r.take_rows(chosen, same)
+        evaluated, white = evaluate_rows(few, poses, trials, linear.solution.nuisance)
+        Z = few.whiten_columns(white, evaluated.jacobian)[0] @ S[few.poses]
+        values[own] = Z[row, rows.column[own]]
     values *= list_units(linear)
     chosen = statistics.find_distinct(places)
     of_poses = (places[:, None] == chosen)[:, :, None] * values[:, None, :]

@@ -52,14 +52,14 @@ from loopcal.results.description import Field, fields, label_axes
 from loopcal.results.result import TableResult
 from loopcal.typing import BoolArray, FloatArray, IntArray, Progress, report_no_progress
 
-# Remaining part 1 - w g of a direction below which only this block determines it, so that its
-# residual tests nothing.
+# Variance of a residual of the fit, in units of the noise, below which only this block determines
+# its direction, so that it tests nothing.
 TESTABLE = 1e-6
-# Variance of a predicted residual outside the fit, in units of the noise, above which the fit
-# does not predict it.
+# Variance of a predicted residual outside the fit above which the fit does not predict it.
 UNPREDICTABLE = 1e10
 # Standard deviation in spreads that stands in G for a direction that the fit does not use.
 UNDETERMINED = 1e6
+TOGETHER = 1_000_000  # numbers of the blocks that are compared together, about
 
 
 class Influence(NamedTuple):
@@ -127,21 +127,31 @@ def compute_block_influence(
     """Return the influence of b blocks of equal size.
 
     half : (b, m, k) square root of G. residual : (b, m). present : (b, m) rows that exist; the
-        others are zero. weight : (b,) of the blocks in the fit.
+        others are zero. weight : (b,) of the blocks in the fit, 1 or 0.
     """
-    g, vectors = np.linalg.eigh(half @ half.swapaxes(-1, -2))
-    w = weight[:, None]
-    remaining = 1.0 - w * g
-    # absent rows are zero: eigenvectors of value zero and residual zero, subtracted below
-    tested = (remaining > TESTABLE) & ((1.0 - w) * g < UNPREDICTABLE)
+    G, identity = half @ half.swapaxes(-1, -2), np.eye(half.shape[1])
+    variance = identity + (1.0 - 2.0 * weight)[:, None, None] * G
+    leverage, count = np.einsum("bii->b", G), present.sum(axis=1)
+    if (leverage < UNPREDICTABLE).all() and _are_positive(variance - TESTABLE * identity):
+        solved = np.linalg.solve(variance, residual[..., None])[..., 0]
+        return Influence(weight * leverage, count, (residual * solved).sum(axis=1), count)
+    v, vectors = np.linalg.eigh(variance)
+    # absent rows are zero: eigenvectors of value one and residual zero, subtracted below
+    tested = (v > TESTABLE) & (v < UNPREDICTABLE)
     square = np.matmul(residual[:, None, :], vectors)[:, 0] ** 2
-    normed = square / (np.where(tested, remaining, 1.0) * (1.0 + (1.0 - w) * g))
+    distance = np.divide(square, v, out=np.zeros_like(v), where=tested).sum(axis=1)
     return Influence(
-        (w * g).sum(axis=1),
-        present.sum(axis=1),
-        np.where(tested, normed, 0.0).sum(axis=1),
-        tested.sum(axis=1) - (~present).sum(axis=1),
+        weight * leverage, count, distance, tested.sum(axis=1) - (~present).sum(axis=1)
     )
+
+
+def _are_positive(matrices: FloatArray) -> bool:
+    """Return whether all matrices (b, m, m) are positive definite."""
+    try:
+        np.linalg.cholesky(matrices)
+    except np.linalg.LinAlgError:
+        return False
+    return True
 
 
 def iterate_blocks(
@@ -172,12 +182,14 @@ def iterate_blocks(
         numbers, first, sizes = np.unique(block_of_row, return_index=True, return_counts=True)
         complete = sizes == total[numbers]
         for size in statistics.find_distinct(sizes[complete]):
-            chosen = complete & (sizes == size)
-            places = order[first[chosen][:, None] + np.arange(size)]
-            own, columns = join_columns(unknowns[places], moved[places])
-            rest = machine[places]
-            columns = np.concatenate([columns, rest[..., :-1]], axis=2)
-            yield numbers[chosen], own, columns, rest[..., -1]
+            alike = np.flatnonzero(complete & (sizes == size))
+            most = max(1, TOGETHER // int(size * (size + machine.shape[1] + width)))
+            for chosen in np.split(alike, range(most, len(alike), most)):
+                places = order[first[chosen][:, None] + np.arange(size)]
+                own, columns = join_columns(unknowns[places], moved[places])
+                rest = machine[places]
+                columns = np.concatenate([columns, rest[..., :-1]], axis=2)
+                yield numbers[chosen], own, columns, rest[..., -1]
         is_left = np.repeat(~complete, sizes)
         left = order[is_left]
         waiting = [(block_of_row[is_left], unknowns[left], moved[left], machine[left])]

@@ -43,6 +43,7 @@ from loopcal.numerics.statistics import (
     NEAR_ONE,
     compute_chi_square_quantile,
     compute_chi_square_tail,
+    find_distinct_rows,
     invert_increasing,
     student_probability,
 )
@@ -407,7 +408,7 @@ class PosePredictions:
     def residuals(self, observations: Sequence[Observations]) -> list[FloatArray]:
         """Return the prediction errors (r, m) of every kind."""
         return [
-            o.evaluate(self.T, *self._inputs_of(i, o)).residual[0]
+            o.compute_residuals(self.T, *self._inputs_of(i, o))[0]
             for i, o in enumerate(observations)
         ]
 
@@ -421,8 +422,8 @@ class PosePredictions:
             zero = np.zeros((1, *o.present.shape))
             expected = o.kind.measure(self.T[:, o.rows], zero, setup, joints, o.labels)
             _, reached_joints = other._inputs_of(i, o)
-            evaluation = o.kind.evaluate(other.T[:, o.rows], expected, setup, reached_joints)
-            differences.append(evaluation.residual[0])
+            at = other.T[:, o.rows], expected, setup, reached_joints
+            differences.append(o.kind.compute_residuals(*at)[0])
         return differences
 
     def setup_deviations(
@@ -432,23 +433,28 @@ class PosePredictions:
         move the predictions (r,) of every kind, in standard deviations of its noise; 0 where that
         is rounding beside what each of them does by itself.
         """
-        alone = np.linalg.norm(root.values, axis=1)
-        sizes = []
+        alone, sizes = np.linalg.norm(root.values, axis=1), []
         for i, o in enumerate(observations):
-            by_setup = o.evaluate(self.T, *self._inputs_of(i, o)).nuisance
-            used, factor = self.setup.indices[i], self.setup.factor(i)
-            if by_setup is None or not used.shape[1]:
-                sizes.append(np.zeros(len(o)))
+            used, factor, inputs = (
+                self.setup.indices[i],
+                self.setup.factor(i),
+                self._inputs_of(i, o),
+            )
+            sizes.append(size := np.zeros(len(o)))
+            if not used.size:
                 continue
-            moved = o.whitener @ by_setup[0] * (1.0 if factor is None else factor[:, None])
-            together = np.zeros(len(o))
-            sets, set_of = np.unique(used, axis=0, return_inverse=True)
-            order = np.argsort(set_of.ravel(), kind="stable")
-            parts = np.split(order, np.cumsum(np.bincount(set_of.ravel()))[:-1])
-            for own, mine in zip(sets, parts, strict=True):
-                together[mine] = np.linalg.norm(moved[mine] @ root.fill(own), axis=(1, 2))
-            most = np.linalg.norm(moved * alone[used][:, None], axis=(1, 2))
-            sizes.append(np.where(together > SMALLEST_EFFECT * most, together, 0.0))
+            sets, set_of = find_distinct_rows(used)
+            order = np.argsort(set_of, kind="stable")
+            parts = np.split(order, np.cumsum(np.bincount(set_of))[:-1])
+            for own, mine in zip(sets, parts, strict=True):  # so that derivatives are of few rows
+                of_part = (None if each is None else each[:, mine] for each in inputs)
+                by_setup = o.take(mine).evaluate(self.T, *of_part).nuisance
+                assert by_setup is not None
+                moved = o.whitener[mine] @ by_setup[0]
+                moved = moved if factor is None else moved * factor[mine, None]
+                together = np.linalg.norm(moved @ root.fill(own), axis=(1, 2))
+                most = np.linalg.norm(moved * alone[own], axis=(1, 2))
+                size[mine] = np.where(together > SMALLEST_EFFECT * most, together, 0.0)
         return sizes
 
     def _inputs_of(self, i: int, o: Observations) -> tuple[FloatArray | None, FloatArray | None]:
@@ -663,7 +669,10 @@ def predict_poses(
     values, kept = unknowns.values(), frozenset[str]()
     if setup is not None and len(unknowns):
         kept = frozenset(unknowns.table.names) & setup.keys()
-        values = fit_nuisance_values(robot, data, T, _fix_nuisance(unknowns, setup), joints)
+        if len(kept) == len(unknowns):
+            values = np.array([setup[name] for name in unknowns.table.names])
+        else:
+            values = fit_nuisance_values(robot, data, T, _fix_nuisance(unknowns, setup), joints)
     return PosePredictions(T[None], joints, unknowns, values[None], kept)
 
 

@@ -28,7 +28,7 @@ from loopcal.measure.readings import (
     resolve_reading_sigma,
 )
 from loopcal.mechanism.model import Mechanism
-from loopcal.numerics.statistics import compute_known_median, compute_median, find_distinct
+from loopcal.numerics.statistics import compute_known_median, compute_median
 from loopcal.results.tables import to_quantity
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import DISPLAY_UNITS, find_unit
@@ -325,7 +325,8 @@ def _find_static_targets(measurements: Measurements) -> Iterator[_StaticTarget]:
         if not comparable or len(rows) < 3:
             continue
         noise = np.sqrt(np.einsum("rii->ri", rows.covariance)).max(axis=0)
-        targets = {name: list(columns) for name, columns in kind.target_columns.items()}
+        whole = kind.target_columns
+        targets = {name: list(columns) for name, columns in whole.items()}
         if len(noise) != len(kind.columns):
             noise = np.full(len(kind.columns), noise.max())
         elif len(kind.columns) > 1:  # each column by itself, too
@@ -337,16 +338,26 @@ def _find_static_targets(measurements: Measurements) -> Iterator[_StaticTarget]:
             _, of, count = np.unique(own, axis=0, return_inverse=True, return_counts=True)
             alike = is_measured.copy()
             alike[is_measured] = of.ravel() == np.argmax(count) if len(count) else False
-        for session in find_distinct(rows.session):
-            for target, columns in targets.items():
-                is_complete = alike & ~np.any(np.isnan(rows.measured[:, columns]), axis=1)
-                present = (rows.session == session) & is_complete
-                if np.count_nonzero(present) < 3:
-                    continue
-                range_ = np.ptp(rows.measured[present][:, columns], axis=0)
-                limit = STATIC_SIGMAS * noise[columns] if target in kind.target_columns else 1e-15
-                if np.all(range_ < limit):
-                    yield _StaticTarget(rows, target, present, columns, range_, noise[columns])
+        names, number = np.unique(rows.session, return_inverse=True)
+        by_session = np.argsort(number, kind="stable")
+        for target, columns in targets.items():
+            values = rows.measured[:, columns]
+            is_complete = alike & ~np.any(np.isnan(values), axis=1)
+            count = np.bincount(number[is_complete], minlength=len(names))
+            sessions = np.flatnonzero(count)
+            if not len(sessions):
+                continue
+            first, ordered = (
+                (np.cumsum(count) - count)[sessions],
+                by_session[is_complete[by_session]],
+            )
+            ends = (f.reduceat(values[ordered], first) for f in (np.maximum, np.minimum))
+            range_ = np.subtract(*ends)
+            limit = STATIC_SIGMAS * noise[columns] if target in whole else 1e-15
+            is_static = (count[sessions] >= 3) & np.all(range_ < limit, axis=1)
+            for i in np.flatnonzero(is_static):
+                present = is_complete & (number == sessions[i])
+                yield _StaticTarget(rows, target, present, columns, range_[i], noise[columns])
 
 
 def _group_equal_kinds(observations: tuple[Observations, ...]) -> list[list[Observations]]:

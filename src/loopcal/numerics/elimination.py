@@ -237,14 +237,18 @@ class NodeFactors:
     """The rows of all nodes, folded into triangular factors where they are many: working memory.
 
     tree : of the U unknowns. trials : a. parameters : p of the machine.
+    most : numbers of rows, about, from which they are folded where that leaves fewer.
     """
 
     tree: EliminationTree
     trials: int
     parameters: int
+    most: float
 
-    def __init__(self, tree: EliminationTree, trials: int, parameters: int) -> None:
-        self.tree, self.trials, self.parameters = tree, trials, parameters
+    def __init__(
+        self, tree: EliminationTree, trials: int, parameters: int, most: float = 4e6
+    ) -> None:
+        self.tree, self.trials, self.parameters, self.most = tree, trials, parameters, most
         self._factors: list[FloatArray] = [
             np.zeros((trials, len(s), 0, s.width + parameters + 1)) for s in tree.structures
         ]
@@ -253,22 +257,27 @@ class NodeFactors:
     def add(self, rows: BlockRows) -> None:
         """Add rows of nodes."""
         self._rows.append(rows)
-        if sum(part.machine.size + part.by_unknowns.size for part in self._rows) > KEPT:
-            self._fold()
+        if sum(part.machine.size + part.by_unknowns.size for part in self._rows) > self.most:
+            self._fold(least=1)
 
-    def _fold(self) -> None:
-        """Fold all rows into the factors."""
+    def _fold(self, least: int) -> None:
+        """Fold all rows of structures into their factors that are `least` times as many as those of
+        full triangles.
+        """
         for structure in sorted({part.structure for part in self._rows}):
             own = [part for part in self._rows if part.structure == structure]
+            places = np.concatenate([p.places.repeat(p.machine.shape[2]) for p in own])
+            nodes, _, width = self._factors[structure].shape[1:]
+            if len(places) < least * nodes * width:
+                continue
             filled = [fill_rows(part, self.tree) for part in own]
             rows = filled[0] if len(filled) == 1 else np.concatenate(filled, axis=1)
-            places = np.concatenate([p.places.repeat(p.machine.shape[2]) for p in own])
             self._factors[structure] = fold_at(self._factors[structure], rows, places)
-        self._rows = []
+            self._rows = [part for part in self._rows if part.structure != structure]
 
     def arrays(self) -> list[FloatArray]:
         """Return the factors (a, n, h, w + p + 1) of every structure; h = 0 without rows."""
-        self._fold()
+        self._fold(least=0)
         return list(self._factors)
 
     def list_rows(self) -> list[BlockRows]:
@@ -607,8 +616,6 @@ def _carry_inwards(
     return carried, clusters
 
 
-# Numbers of rows that are kept, about, before they are folded.
-KEPT = 4_000_000
 FOLDED = 500_000  # numbers that are folded by one call
 
 

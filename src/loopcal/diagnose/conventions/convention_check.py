@@ -243,11 +243,10 @@ def find_moved_setups(
         determine them.
     """
     names = tuple(names)
-    if not names:
+    if not names or not (kept := sizes(())[0]) > ABOVE:
         return None
-    kept, _ = sizes(())
     fitted, left = sizes(names)
-    if left < FEWEST or not kept > ABOVE or not kept > SMALLER * fitted:
+    if left < FEWEST or not kept > SMALLER * fitted:
         return None
     moved = names
     if len(names) > 1:

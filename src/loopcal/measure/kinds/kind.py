@@ -616,6 +616,25 @@ class Kind(ABC):
         jacobian = np.where(by_twist, result.jacobian, 0.0)
         return Evaluation(residual, jacobian, by_nuisance, by_joints)
 
+    def compute_residuals(
+        self,
+        T: FloatArray,
+        measured: FloatArray,
+        nuisance: FloatArray | None,
+        joints: FloatArray | None = None,
+    ) -> FloatArray:
+        """Return the residuals (t, r, m) of `evaluate` from nuisance parameters (t, r, u); those of
+        targets one by one, because each has few derivatives.
+        """
+        if nuisance is None or self.divided is None or self.is_of_base:
+            return self.evaluate(T, measured, nuisance, joints).residual
+        (kind, places), r = self.divided, measured.shape[1]
+        k, both = len(places), (measured, nuisance[..., places])
+        columns, values = (a.reshape(len(a), r * k, -1) for a in both)
+        joints = None if joints is None else joints.repeat(k, axis=1)
+        residual = kind.evaluate(T.repeat(k, axis=1), columns, values, joints).residual
+        return residual.reshape(len(residual), r, -1)
+
     def _find_platform(self, T: FloatArray, joints: FloatArray) -> FloatArray:
         """Return the measured bodies (.., 4, 4): end platforms T, those of a stage, or the base."""
         if not self.of:
