@@ -292,9 +292,6 @@ EULER_ORDERS = _SEQUENCES + tuple(sequence.upper() for sequence in _SEQUENCES)
 # first angle is set to zero.
 _GIMBAL = 1e-15
 
-Vector = tuple[FloatArray, ...]
-"""Three components (...) of vectors."""
-
 
 def wrap_angle(angle: FloatArray | float) -> FloatArray:
     """Return angles (...) plus full turns, in (-pi, pi] [rad]."""
@@ -382,26 +379,30 @@ def euler_rates(angles: FloatArray, order: str) -> FloatArray:
     About moving axes the columns are `ei`, `Ri(a1) ej`, `Ri(a1) Rj(a2) ek`. Singular if two axes
     are parallel.
     """
-    columns, fixed = _rate_columns(angles, order)
+    (c, s, along, across), place, fixed = _rate_terms(angles, order)
+    columns = ((1.0, 0.0, 0.0), (0.0, c, s), (along, -s * across, c * across))
     columns = columns[::-1] if fixed else columns
-    return stack_matrix(tuple(zip(*columns, strict=True)))
+    return stack_matrix(tuple(tuple(column[a] for column in columns) for a in place))
 
 
 def euler_rates_inverse(angles: FloatArray, order: str) -> FloatArray:
     """Return the inverse of `euler_rates`, `d(angles) = E^-1 omega`; huge if two axes are parallel.
 
-    The rows are cross products of the columns of E over its determinant, +-cos(a2) or +-sin(a2).
+    Its determinant is +-cos(a2) or +-sin(a2).
     """
-    (first, second, third), fixed = _rate_columns(angles, order)
-    across = _cross(second, third)
-    determinant = _nonzero(across[0] * first[0] + across[1] * first[1] + across[2] * first[2])
-    rows = (across, _cross(third, first), _cross(first, second))
+    (c, s, along, across), place, fixed = _rate_terms(angles, order)
+    across = _nonzero(across)
+    c_third, s_third = c / across, s / across
+    rows = ((1.0, along * s_third, -along * c_third), (0.0, c, s), (0.0, -s_third, c_third))
     rows = rows[::-1] if fixed else rows
-    return stack_matrix(tuple(tuple(entry / determinant for entry in row) for row in rows))
+    return stack_matrix(tuple(tuple(row[a] for a in place) for row in rows))
 
 
-def _rate_columns(angles: FloatArray, order: str) -> tuple[tuple[Vector, ...], bool]:
-    """Return the columns of `euler_rates` about moving axes, and whether they are in reverse."""
+def _rate_terms(angles: FloatArray, order: str) -> tuple[tuple[FloatArray, ...], list[int], bool]:
+    """Return the numbers c, s, p, r of the columns of `euler_rates` about moving axes, (1, 0, 0),
+    (0, c, s) and (p, -s r, c r) along axes i, j, k; the places of x, y, z among these, and whether
+    the columns are in reverse.
+    """
     (i, j, last), fixed = _moving_axes(order)
     moving = angles[..., ::-1] if fixed else angles
     k, sign = 3 - i - j, 1.0 if (j - i) % 3 == 1 else -1.0
@@ -409,15 +410,7 @@ def _rate_columns(angles: FloatArray, order: str) -> tuple[tuple[Vector, ...], b
     s, ss = sign * s, sign * ss
     # Rj(a2) turns ek by ss towards ei, and ei by -ss towards ek; Ri(a1) turns ek by -s towards ej
     along, across = (cc, -ss) if last == i else (ss, cc)
-    zero, one = np.zeros_like(c), np.ones_like(c)
-    by_axes = ((one, zero, zero), (zero, c, s), (along, -s * across, c * across))
-    place = np.argsort((i, j, k))
-    return tuple(tuple(column[a] for a in place) for column in by_axes), fixed
-
-
-def _cross(a: Vector, b: Vector) -> Vector:
-    """Return the cross product of vectors given by their components."""
-    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+    return (c, s, along, across), sorted(range(3), key=(i, j, k).__getitem__), fixed
 
 
 def _nonzero(divisor: FloatArray) -> FloatArray:

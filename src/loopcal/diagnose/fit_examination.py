@@ -277,7 +277,7 @@ def compute_reading_errors(
     recorded = data.readings
     compared = np.isfinite(sigma) & (sigma > 0.0) & np.isfinite(recorded) & np.isfinite(estimated)
     reading = np.where(compared, recorded - estimated, np.nan)
-    _, drives = robot.slots(robot.values[None])
+    _, drives = robot.present
     # values of the driven joints, or of their sums; a condition has none
     own, joint = ~drives.fixed_rows, np.full_like(reading, np.nan)
     values = [drives.transmit(q[None])[0][:, own] for q in (recorded, estimated)]

@@ -16,16 +16,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loopcal import geometry
-from loopcal.engine import CONVERGED, EXHAUSTED, NOT_FINITE, STALLED, State
+from loopcal.engine import State
 from loopcal.mechanism.limb_rows import name_entries
 from loopcal.mechanism.model import Mechanism, Stage
 from loopcal.typing import FloatArray, IntArray
 
 # States of a chain: those of its stages, joined, and the frames of its platforms.
 
-# Statuses of stages in order: the last one is that of the chain. Any other status, such as that of
-# another mode, is less severe than an open loop.
-SEVERITY = {CONVERGED: 0, EXHAUSTED: 2, STALLED: 3, NOT_FINITE: 4}
+# Ranks of CONVERGED, STALLED, EXHAUSTED, NOT_FINITE and others: the highest one among its stages is
+# that of a chain. Another mode is less severe than an open loop.
+SEVERITY = 0, 3, 2, 4, 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,9 +49,7 @@ def join_stage_states(robot: Mechanism, states: Sequence[State]) -> State:
         return states[0]
     poses = tuple(state.T for state in states)
     statuses = np.stack([state.status for state in states])
-    severity = np.ones(statuses.shape)
-    for known, rank in SEVERITY.items():
-        severity[statuses == known] = rank
+    severity = np.take(SEVERITY, statuses, mode="clip")
     status = np.take_along_axis(statuses, severity.argmax(axis=0)[None], axis=0)[0]
     return ChainState(
         locate_stage_bases(robot.stages, poses)[1][-1],

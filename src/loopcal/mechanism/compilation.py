@@ -176,9 +176,9 @@ def _close_at_home(
         record,
     )
     if robot.is_serial and not robot.controlled:
-        e, _ = robot.slots(robot.values[None])
+        loops = kinematics.Loops.place(robot)
         joints = driven_values(robot.program, robot.home_state)
-        return replace(robot, home_state=kinematics.solve_serial(robot, e, joints))
+        return replace(robot, home_state=loops.solve(joints, robot.home_state))
     robot = replace(robot, home_state=_find_home(robot))
     mobility = _count_freedoms(assembly, program)
     if has_spare := _has_spare_drives(assembly, mobility):

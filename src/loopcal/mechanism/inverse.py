@@ -9,7 +9,7 @@ docs/theory/kinematics.md.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -20,7 +20,7 @@ from loopcal.engine import CONVERGED, EXHAUSTED, NOT_FINITE, STALLED, State
 from loopcal.mechanism import chains
 from loopcal.mechanism.actuation import OpenSums, list_open_sums, scale_sums
 from loopcal.mechanism.kinematics import Loops, compute_closure_sign, solve_serial
-from loopcal.mechanism.limb_rows import follow_links, place_serial
+from loopcal.mechanism.limb_rows import move_joints, place_serial
 from loopcal.mechanism.model import Mechanism, Stage
 from loopcal.mechanism.platform_coordinates import (
     compare_coordinates,
@@ -29,7 +29,7 @@ from loopcal.mechanism.platform_coordinates import (
 )
 from loopcal.mechanism.sensitivity import differentiate_by_drives
 from loopcal.mechanism.states import Status, driven_values, put_poses, without_poses
-from loopcal.mechanism.transmission import Transmissions, apply_weights
+from loopcal.mechanism.transmission import Transmissions, apply_weights, invert_weights
 from loopcal.numerics.gauss_newton import ROUNDING as ROUNDED
 from loopcal.numerics.trial_batch import TrialBatch, map_arrays
 from loopcal.typing import BoolArray, FloatArray, IntArray
@@ -185,30 +185,35 @@ class _Rows:
 
     A robot of one stage is a chain of itself.
 
-    values : (1 | R, p). target : (R, c) controlled coordinates. e, links, sums, terms : of each
-        stage displacements, links and pitches of `place_serial` without loops, open sums, and
-        transmissions, (1 | R, ..).
+    values : (1 | R, p). target : (R, c) controlled coordinates. e, sums, drives, fronts : of each
+        stage displacements or `Placed` links without loops, open sums, transmissions, and the frame
+        before its first joint, of loops their base, in the platform that carries it, (1 | R, ..).
+    behind, advance : (1 | R, u, ..) links behind the joints of serial stages, and their advances.
     sign : (R,) of det(C D) at the start. moving : drives that carry the end platform.
     turns : (u,) whether each drive turns joints, so that its unit counts for the robot's size.
     spans : (u,) strokes of the drives, of which steps take equal shares with more drives than
         coordinates; a full turn or the size without a stroke, and where the step is unique.
     poses : (R, 4, 4) in place of coordinates, of which the nearest ones are searched for.
+    known : the iterate of home, once it is known.
     """
 
-    shared: ClassVar[tuple[str, ...]] = ("robot", "turns", "spans", "moving")
+    shared: ClassVar[tuple[str, ...]] = ("robot", "turns", "spans", "moving", "known")
 
     robot: Mechanism
     values: FloatArray
     target: FloatArray
-    e: tuple[FloatArray, ...]
-    links: tuple[tuple[FloatArray, FloatArray] | None, ...]
+    e: tuple[Any, ...]
     sums: tuple[OpenSums | None, ...]
     drives: tuple[Transmissions, ...]
+    fronts: tuple[FloatArray, ...]
+    behind: FloatArray
+    advance: FloatArray
     sign: FloatArray
     turns: BoolArray
     spans: FloatArray
     moving: IntArray
     poses: FloatArray | None = None
+    known: dict[str, _Iterate] = field(default_factory=dict)
 
     def select(self, rows: IntArray) -> _Rows:
         """Return some rows by their positions."""
@@ -218,51 +223,53 @@ class _Rows:
 
     def evaluate(self, u: FloatArray, begin: tuple[State, ...]) -> _Iterate:
         """Return the iterate at driven joints u (R, u); its gap is infinite for an open loop."""
-        stages, states, moved = self.robot.blocks, list[State](), list[tuple[FloatArray, Any]]()
-        ok, loops = np.isfinite(u).all(axis=1), iter(begin)
+        return self.aim(self.locate(u, begin))
+
+    def locate(self, u: FloatArray, begin: tuple[State, ...]) -> _Iterate:
+        """Return the iterate at driven joints u (R, u), without the target."""
+        ok, loops, states = np.isfinite(u).all(axis=1), iter(begin), list[State]()
+        T, platforms, moved = np.eye(4), {-1: np.eye(4)}, list[tuple[Any, ...]]()
         with np.errstate(invalid="ignore"):
-            for stage, e, links, sums in zip(stages, self.e, self.links, self.sums, strict=True):
-                robot, own, weights = stage.robot, _select_drives(stage, u), None
-                if links is not None:
-                    (group,) = robot.program.groups
-                    joints = own[:, 0, group.actuator[:-1, 0]]
-                    *frames, last = follow_links(group.joints, *links, joints)
-                    moved.append((last, frames))
-                    continue
-                if sums is not None:
-                    weights, own = sums.weights, sums.complete(u[:, None, stage.actuators])
-                state = Loops(robot, e, weights).close(own, next(loops), follow=False)
-                by_drive = differentiate_by_drives(robot, e, own, state, weights)[:, 0]
-                moved.append((state.T[:, 0], by_drive))
-                states.append(state)
-                ok &= state.status[:, 0] == CONVERGED
-            bases, platforms = chains.locate_stage_bases(stages, [T for T, _ in moved])
-            D, T = np.zeros((len(u), 6, u.shape[1])), platforms[-1]
-            # frames and advances of joints in serial stages, zero for others
-            joints, advance = np.zeros((*u.shape, 4, 4)), np.zeros(u.shape)
-            for i in chains.list_carrying_stages(self.robot):
-                (_, by_drive), links, drives = moved[i], self.links[i], stages[i].actuators
-                if links is not None:
-                    for column, frame in enumerate(by_drive, drives.start):
-                        joints[:, column] = bases[i] @ frame
-                    advance[:, drives] = links[1]
-                    continue
-                vectors = by_drive.reshape(len(by_drive), 2, 3, -1)
-                turned, shifted = np.moveaxis(bases[i][..., None, :3, :3] @ vectors, 1, 0)
-                shifted = shifted - geometry.hat(T[..., :3, 3] - platforms[i][..., :3, 3]) @ turned
-                own, sums = np.concatenate([turned, shifted], axis=1), self.sums[i]
-                places = np.arange(own.shape[2]) if sums is None else sums.places
-                D[..., drives.start + places] = own[..., : len(places)]
-            axes, arms = joints[..., :3, 2], T[..., None, :3, 3] - joints[..., :3, 3]
-            turning = axes * self.turns[:, None]
-            moving = advance[..., None] * axes + np.cross(turning, arms)
-            D += np.concatenate([turning, moving], axis=2).swapaxes(1, 2)
+            steps = move_joints(self.turns, u, self.advance) @ self.behind
+            for i, (stage, sums) in enumerate(zip(self.robot.blocks, self.sums, strict=True)):
+                robot, first = stage.robot, stage.actuators.start
+                T = platforms[stage.parent] @ self.fronts[i]
+                if robot.is_serial:
+                    for j in first + robot.program.groups[0].actuator[:-1]:
+                        axis = T[..., :3, 2:3]
+                        by_joint = axis * self.turns[j], axis * self.advance[:, j, None]
+                        moved.append((i, j, *by_joint, T))
+                        T = T @ steps[:, j[0]]
+                else:
+                    own, weights, by_sums = _select_drives(stage, u), None, None
+                    if sums is not None:
+                        weights, own = sums.weights, sums.complete(u[:, None, stage.actuators])
+                        if not robot.has_open_sums and weights.shape[1] == weights.shape[2]:
+                            weights, by_sums = None, invert_weights(weights)
+                            own = apply_weights(by_sums, own)
+                    state = Loops(robot, self.e[i], weights).close(own, next(loops), follow=False)
+                    states.append(state)
+                    ok &= state.status[:, 0] == CONVERGED
+                    by_drive = differentiate_by_drives(robot, self.e[i], own, state, weights)[:, 0]
+                    if by_sums is not None:
+                        by_drive = by_drive @ by_sums
+                    places = np.arange(by_drive.shape[2]) if sums is None else sums.places
+                    twists = by_drive[..., : len(places)].reshape(len(u), 2, 3, -1)
+                    twists, T = T[..., None, :3, :3] @ twists, T @ state.T[:, 0]
+                    moved.append((i, first + places, twists[:, 0], twists[:, 1], T))
+                platforms[i] = T
+            D, carrying = np.zeros((len(u), 6, u.shape[1])), chains.list_carrying_stages(self.robot)
+            for i, places, turned, shifted, at in moved:
+                if i in carrying:
+                    arm = T[..., :3, 3] - at[..., :3, 3]
+                    D[:, :3, places] = turned
+                    D[:, 3:, places] = shifted - geometry.hat(arm) @ turned
         D[~ok] = np.nan
         none = np.zeros(len(u))
         status, zero = none.astype(np.int8), np.zeros_like(u)
         T = np.broadcast_to(T, (len(u), 4, 4))
         parts = tuple(states), T, D, none, none, zero, none, status, none.astype(int)
-        return self.aim(_Iterate(u, *parts))
+        return _Iterate(u, *parts)
 
     def compare(self, T: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return how far poses (R, 4, 4) are from the targets (R, c) [m], and the columns (R, c, 6)
@@ -412,94 +419,100 @@ def _solve_by_drives(
         begin = replace(whole, closure_sign=compute_closure_sign(robot, values, whole))
     wanted = np.broadcast_to(target, (t, n, target.shape[2])).reshape(t * n, -1)
     own = values if len(values) == 1 else np.repeat(values, n, axis=0)
-    rows = _make_rows(robot, own, wanted)
-    first = begin.select((t, n), *np.divmod(np.arange(t * n), n))
+    rows, is_open = _make_rows(robot, own, wanted), robot.program.may_stay_open and not robot.stages
+    first = begin
+    if is_open or len(values) > 1 or begin.T.shape[:2] != (1, 1):
+        first = begin.select((t, n), *np.divmod(np.arange(t * n), n))
     start = _begin(rows, first)
     rows = replace(rows, sign=start.sign)
-    is_open = robot.program.may_stay_open and not robot.stages
     last = rows.iterate(_begin_near_targets(rows, start, first) if is_open else start)
     wrong = np.flatnonzero(last.status != CONVERGED)
     if follow and len(wrong):
         last = last.put(wrong, _follow_path(rows.select(wrong), start.take(wrong)))
     status = np.where(np.isfinite(wanted).all(axis=1), last.status, np.int8(NOT_FINITE))
-    state = rows.join_states(last)
-    left = np.linalg.norm(
-        compare_coordinates(last.T, wanted, robot.controlled, robot.size)[0], axis=1
-    )
+    state, left, failed = rows.join_states(last), np.zeros(len(status)), status != CONVERGED
+    if failed.any():
+        gap, _ = compare_coordinates(last.T[failed], wanted[failed], robot.controlled, robot.size)
+        left[failed] = np.linalg.norm(gap, axis=1)
     state = replace(
-        state,
-        status=status[:, None],
-        residual=np.where(status == CONVERGED, 0.0, left)[:, None],
-        iterations=last.count[:, None],
+        state, status=status[:, None], residual=left[:, None], iterations=last.count[:, None]
     )
     return map_arrays(lambda a: a.reshape(t, n, *a.shape[2:]), state)
 
 
 def _make_rows(robot: Mechanism, values: FloatArray, target: FloatArray) -> _Rows:
     """Return rows with values (1 | R, p) and targets (R, c)."""
-    slots, links, sums, turns = list[tuple[FloatArray, Transmissions]](), [], [], list[bool]()
-    robot = robot.exact
+    rows: _Rows | None = robot.derived.get("rows")
+    if rows is None or not np.array_equal(values, rows.values):
+        rows = robot.derived["rows"] = _place_rows(robot, values)
+    return replace(rows, target=target, sign=np.zeros(len(target)))
+
+
+def _place_rows(robot: Mechanism, values: FloatArray) -> _Rows:
+    """Return rows with values (1 | R, p), without targets."""
+    robot, parts, turns = robot.exact, list[tuple[Any, ...]](), list[bool]()
+    behind = np.tile(np.eye(4), (len(values), len(robot.actuators), 1, 1))
+    advance = np.zeros(behind.shape[:2])
     for stage in robot.blocks:
         own, assembly = values[:, stage.parameters], stage.robot.assembly
-        slots.append(stage.robot.slots(own))
-        is_serial, has_sums = stage.robot.is_serial, stage.robot.has_open_sums
-        chosen = stage.robot.determining_readings
+        (e, drives), front = stage.robot.slots(own), stage.mount[None]
+        chosen, has_sums = stage.robot.determining_readings, stage.robot.has_open_sums
         has_sums |= bool(assembly.couplings) or chosen is not None
-        links.append(
-            place_serial(stage.robot.program.groups[0], slots[-1][0]) if is_serial else None
-        )
-        sums.append(list_open_sums(stage.robot, own, chosen) if has_sums else None)
-        drives = [(name,) for name in assembly.driven_joints]
+        if stage.robot.is_serial:
+            (group,) = stage.robot.program.groups
+            links, advances = e = place_serial(group, e)
+            front, columns = (
+                stage.mount @ links[:, 0],
+                stage.actuators.start + group.actuator[:-1, 0],
+            )
+            behind[:, columns], advance[:, columns] = links[:, 1:], advances
+        sums = list_open_sums(stage.robot, own, chosen) if has_sums else None
+        parts.append((e, sums, drives, front))
+        moved = [(name,) for name in assembly.driven_joints]
         if has_sums:
-            drives = [actuator.driven_joints for actuator in assembly.actuators]
-        drives += [()] * (len(assembly.actuators) - len(drives))  # conditions
-        turns += [not assembly.turning_drives.isdisjoint(names) for names in drives]
-    e, transmissions = zip(*slots, strict=True)
-    return _Rows(
-        robot,
-        values,
-        target,
-        e,
-        tuple(links),
-        tuple(sums),
-        transmissions,
-        np.zeros(len(target)),
-        np.array(turns),
-        measure_spans(robot, np.array(turns)),
-        chains.find_carrying_actuators(robot),
-    )
+            moved = [actuator.driven_joints for actuator in assembly.actuators]
+        moved += [()] * (len(assembly.actuators) - len(moved))  # conditions
+        turns += [not assembly.turning_drives.isdisjoint(names) for names in moved]
+    (e, sums, drives, fronts), turning = zip(*parts, strict=True), np.array(turns)
+    spans, moving = measure_spans(robot, turning), chains.find_carrying_actuators(robot)
+    fixed = e, sums, drives, fronts, behind, advance, np.zeros(0), turning, spans, moving
+    return _Rows(robot, values, np.zeros((0, 0)), *fixed)
 
 
 def measure_spans(robot: Mechanism, turns: BoolArray) -> FloatArray:
     """Return the `spans` of the drives (u,) of a robot."""
     spans = np.where(turns, 2 * np.pi, robot.size)
     if chains.has_spare_drives(robot):
-        _, drives = robot.slots(robot.values[None])
+        _, drives = robot.present
         at_rest = ((np.nan if a.reference is None else a.reference,) * 2 for a in robot.actuators)
         strokes = np.array([a.stroke or e for a, e in zip(robot.actuators, at_rest, strict=True)])
         # else readings are open sums
         has_all = robot.is_commanded.sum() == robot.program.n_joints
         convert = drives.find_joints if has_all else drives.transmit
         ends = convert(strokes.T[None])[0][:, ~drives.fixed_rows]
-        stated = np.full(len(turns), np.nan)
-        stated[robot.is_commanded] = np.abs(ends[1] - ends[0])
-        spans = np.where(stated > 0.0, stated, spans)
+        stated, own = np.abs(ends[1] - ends[0]), np.flatnonzero(robot.is_commanded)
+        spans[own] = np.where(stated > 0.0, stated, spans[own])
     return spans
 
 
 def _begin(rows: _Rows, first: State) -> _Iterate:
-    """Return the iterates of a state (R, 1)."""
-    u, loops = np.zeros((len(first.T), len(rows.robot.actuators))), list[State]()
-    states = chains.split_stage_states(rows.robot, first)
-    for stage, own, sums in zip(rows.robot.blocks, states, rows.sums, strict=True):
-        joints = driven_values(stage.robot.program, own)
-        joints = joints if sums is None else sums.read(joints)
-        # a condition behind the joints moves none
-        places = np.arange(joints.shape[2]) if sums is None else sums.places
-        u[:, stage.actuators.start + places] = joints[:, 0]
-        if not stage.robot.is_serial:
-            loops.append(own)
-    return rows.evaluate(u, tuple(loops))
+    """Return the iterates of a state (R, 1), or of one (1, 1) for all rows."""
+    known, R = rows.known if first is rows.robot.home_state else {}, len(rows.target)
+    if "home" not in known:
+        u, loops = np.zeros((len(first.T), len(rows.robot.actuators))), list[State]()
+        states = chains.split_stage_states(rows.robot, first)
+        for stage, own, sums in zip(rows.robot.blocks, states, rows.sums, strict=True):
+            joints = driven_values(stage.robot.program, own)
+            joints = joints if sums is None else sums.read(joints)
+            # a condition behind the joints moves none
+            places = np.arange(joints.shape[2]) if sums is None else sums.places
+            u[:, stage.actuators.start + places] = joints[:, 0]
+            if not stage.robot.is_serial:
+                loops.append(own)
+        known["home"] = rows.locate(u, tuple(loops))
+    if len((now := known["home"]).u) < R:
+        now = map_arrays(lambda a: np.broadcast_to(a, (R, *a.shape[1:])), now)
+    return rows.aim(now)
 
 
 def _begin_near_targets(rows: _Rows, start: _Iterate, first: State) -> _Iterate:

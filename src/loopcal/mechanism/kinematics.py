@@ -19,11 +19,11 @@ from loopcal import engine
 from loopcal.engine import State
 from loopcal.mechanism.actuation import ITERATIONS, DrivenJoints, drive_joints, scale_sums
 from loopcal.mechanism.chains import ChainState, each_stage, join_stage_states, locate_stage_bases
-from loopcal.mechanism.limb_rows import follow_limb, follow_links, place_serial
+from loopcal.mechanism.limb_rows import Placed, follow_limb, follow_links, place_serial
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.sensitivity import differentiate_pose
 from loopcal.mechanism.states import Status, driven_values, list_bodies, replace_rows, without_poses
-from loopcal.mechanism.transmission import LOADED, SOURCE, apply_weights, invert_weights, turn_head
+from loopcal.mechanism.transmission import LOADED, SOURCE, apply_weights, turn_head
 from loopcal.numerics.trial_batch import map_arrays
 from loopcal.typing import BoolArray, FloatArray
 
@@ -83,9 +83,9 @@ class Loops(NamedTuple):
     weights: FloatArray | None
 
     @classmethod
-    def place(cls, robot: Mechanism, values: FloatArray) -> Loops:
-        """Return the loops for parameter values (t | 1, p), of a robot without stages."""
-        e, drives = robot.slots(values)
+    def place(cls, robot: Mechanism, values: FloatArray | None = None) -> Loops:
+        """Return the loops of a robot without stages, for values (t | 1, p), default its own."""
+        e, drives = robot.present if values is None else robot.slots(values)
         return cls(robot, e, drives.weights if robot.has_open_sums else None)
 
     def solve(
@@ -97,7 +97,8 @@ class Loops(NamedTuple):
     ) -> State:
         """Return states (t, n) at joint values or sums (t | 1, n, a), by Newton's method alone."""
         if self.robot.is_serial:
-            return solve_serial(self.robot, self.e, values, begin.T.shape[:2])
+            placed = place_serial(self.robot.program.groups[0], self.e)
+            return solve_serial(self.robot, placed, values, begin.T.shape[:2])
         given = values, begin, None, False, max_iterations, goal, self.state_sums(values)
         return clear_sign(self.robot, engine.solve(self.robot.program, self.e, *given))
 
@@ -109,9 +110,6 @@ class Loops(NamedTuple):
         goal: State | None = None,
     ) -> State:
         """Solve like `forward_trials` for values of joints or their sums (t | 1, n, a)."""
-        if self.weights is not None and self.robot.are_joints(self.weights):
-            joints = apply_weights(invert_weights(self.weights), values)
-            return self._replace(weights=None).close(joints, start, follow, goal)
         begin = clear_sign(self.robot, start or self.robot.home_state)
         state = self.solve(values, begin, goal)
         wrong = find_wrong_rows(self.robot, state, begin.closure_sign)
@@ -218,10 +216,8 @@ def _take_steps(
             before = map_arrays(lambda a: a[:, :-1], states)
             failed = find_wrong_rows(loops.robot, before, sign)
             failed |= before.status != Status.CONVERGED.value
-            wrong, last = (
-                failed.any(axis=1),
-                np.where(failed.any(axis=1), failed.argmax(axis=1), last),
-            )
+            wrong = failed.any(axis=1)
+            last = np.where(wrong, failed.argmax(axis=1), last)
         done = states.select(states.status.shape, np.arange(len(rows)), last)
         if wrong.any():
             left = np.flatnonzero(wrong)
@@ -273,18 +269,17 @@ def forward_trials(
 
 
 def solve_serial(
-    robot: Mechanism, e: FloatArray, driven: FloatArray, shape: tuple[int, ...] = (1, 1)
+    robot: Mechanism, placed: Placed, driven: FloatArray, shape: tuple[int, ...] = (1, 1)
 ) -> State:
-    """Return the state (t, n) at driven joint values (t | 1, n, a) and displacements e (t | 1, d).
+    """Return the state (t, n) at driven joint values (t | 1, n, a) and links of `place_serial`.
 
     Rows whose joint values are not finite are marked. `shape` : (t, n) of the start, 1 broadcasts.
     """
-    (group,) = robot.program.groups
-    t, n = max(len(e), len(driven), shape[0]), max(driven.shape[1], shape[1])
+    (group,), (links, advance) = robot.program.groups, placed
+    t, n = max(len(links), len(driven), shape[0]), max(driven.shape[1], shape[1])
     joints = np.zeros((t, n, len(group.actuator)))
     joints[..., :-1] = driven[..., group.actuator[:-1, 0]]
     with np.errstate(invalid="ignore"):
-        links, advance = place_serial(group, e)
         frames = follow_links(group.joints, links[:, None], advance[:, None], joints)
         T = np.broadcast_to(frames[-1], (t, n, 4, 4))
     finite = np.isfinite(joints).all(axis=2)
@@ -423,7 +418,7 @@ def locate_anchors(robot: Mechanism, state: State) -> tuple[Anchors, ...]:
     place = {name: i for i, name in enumerate(robot.assembly.driven_joints)}
     if not column:
         return ()
-    _, drives = robot.slots(robot.values[None])
+    _, drives = robot.present
     angles = driven_values(robot.program, state)[0]
     frames = compute_limb_frames(robot, robot.values[None], state)
     located = []

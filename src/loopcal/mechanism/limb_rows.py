@@ -14,12 +14,14 @@ import numpy as np
 
 from loopcal import engine, geometry
 from loopcal.engine import LENGTH, PITCH, Group, Program, State
+from loopcal.mechanism.assembly import Joint
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.states import driven_values
 from loopcal.numerics.trial_batch import map_arrays
-from loopcal.typing import FloatArray, IntArray
+from loopcal.typing import BoolArray, FloatArray, IntArray
 
 BLOCK_ROWS = 1024  # rows linearized together
+Placed = tuple[FloatArray, FloatArray]  # links and advances, as of `place_serial`
 
 
 def name_passive_joints(robot: Mechanism) -> tuple[str, ...]:
@@ -197,8 +199,8 @@ def follow_limb(
 
     displacements : (t, s) of this limb. joints : (t, n, J + 1) its joint values.
     """
-    links, pitch = place_links(group, k, displacements)
-    frames = follow_links(group.joints, links[:, None], pitch[:, None], joints)
+    links, advance = place_links(group, k, displacements)
+    frames = follow_links(group.joints, links[:, None], advance[:, None], joints)
     return frames, links[:, None, -1]
 
 
@@ -208,51 +210,55 @@ def follow_links(
     """Return the frames (.., 4, 4) behind each link of (.., J + 1, 4, 4) [m], for the advances
     (.., J) and the values (.., J) of the joints between them.
     """
+    turns, count = np.array([letter == "R" for letter in letters], bool), len(letters)
+    steps = move_joints(turns, joints[..., :count], advance) @ links[..., 1 : count + 1, :, :]
     frames = [links[..., 0, :, :]]
-    for j, letter in enumerate(letters):
-        motion = move_joint(letter, joints[..., j], advance[..., j])
-        frames.append(frames[-1] @ motion @ links[..., j + 1, :, :])
+    for j in range(count):
+        frames.append(frames[-1] @ steps[..., j, :, :])
     return frames
 
 
-def place_serial(group: Group, displacements: FloatArray) -> tuple[FloatArray, FloatArray]:
+def place_serial(group: Group, displacements: FloatArray) -> Placed:
     """Return the links (t, J + 1, 4, 4) of a limb whose joints are all driven, the platform behind
-    the last one, and the advances (t, J) of its joints, 1 for a slide, for displacements (t, s).
+    the last one, and the advances (t, J) of its joints for displacements (t, s).
     """
-    links, pitch = place_links(group, 0, displacements)
+    links, advance = place_links(group, 0, displacements)
     last = links[:, -2] @ geometry.invert_pose(links[:, -1])
-    slides = np.array([letter == "P" for letter in group.joints])
-    return np.concatenate([links[:, :-2], last[:, None]], axis=1), np.where(slides, 1.0, pitch)
+    return np.concatenate([links[:, :-2], last[:, None]], axis=1), advance
 
 
 def place_links(group: Group, k: int, displacements: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the displaced links (t, J + 2, 4, 4) of limb k, the attachment last, and the pitches
-    (t, J) of its joints, for its displacements (t, s).
+    """Return the displaced links (t, J + 2, 4, 4) of limb k, the attachment last, and the advances
+    (t, J) of its joints, pitches and 1 for a slide, for its displacements (t, s).
     """
     # rotations and translations of the links in their own frames
     move = np.zeros((len(displacements), len(group.joints) + 2, 6))
-    pitch = np.broadcast_to(group.pitch[k], (len(displacements), len(group.joints))).copy()
+    slides = [letter == "P" for letter in group.joints]
+    advance = np.tile(np.where(slides, 1.0, group.pitch[k]), (len(displacements), 1))
     for slot, value in zip(group.slots, displacements.T, strict=True):
         if slot.axis == PITCH:
-            pitch[:, slot.element] += value
+            advance[:, slot.element] += value
         elif slot.axis != LENGTH:
             move[:, slot.element, slot.axis] += value
     if not move.any():  # at nominal values
-        return np.broadcast_to(group.links[k], (len(move), *group.links[k].shape)), pitch
+        return np.broadcast_to(group.links[k], (len(move), *group.links[k].shape)), advance
     displaced = geometry.make_pose(geometry.exp_so3(move[..., :3]), move[..., 3:])
-    return group.links[k] @ displaced, pitch
+    return group.links[k] @ displaced, advance
 
 
-def move_joint(letter: str, value: FloatArray, pitch: FloatArray) -> FloatArray:
-    """Return the motion (.., 4, 4) of a joint about (R) or along (P) the z axis."""
-    T = np.zeros((*value.shape, 4, 4))
+def move_joints(turns: BoolArray, value: FloatArray, advance: FloatArray) -> FloatArray:
+    """Return the motions (.., J, 4, 4) of joints, about z where they turn (J,), and along it."""
+    angle = np.where(turns, value, 0.0)
+    T = np.zeros((*angle.shape, 4, 4))
     T[..., 2, 2] = T[..., 3, 3] = 1.0
-    if letter == "R":
-        T[..., 0, 0] = T[..., 1, 1] = np.cos(value)
-        T[..., 1, 0] = np.sin(value)
-        T[..., 0, 1] = -T[..., 1, 0]
-        T[..., 2, 3] = pitch * value
-    else:
-        T[..., 0, 0] = T[..., 1, 1] = 1.0
-        T[..., 2, 3] = value
+    T[..., 0, 0] = T[..., 1, 1] = np.cos(angle)
+    T[..., 1, 0] = np.sin(angle)
+    T[..., 0, 1] = -T[..., 1, 0]
+    T[..., 2, 3] = advance * value
     return T
+
+
+def move_joint(joint: Joint, value: float) -> FloatArray:
+    """Return the motion (4, 4) of one joint."""
+    advance = 1.0 if joint.kind == "P" else joint.pitch
+    return move_joints(np.array(joint.kind == "R"), np.array(value), np.array(advance))

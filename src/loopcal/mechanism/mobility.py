@@ -131,7 +131,7 @@ def _check_open_sums(robot: Mechanism, rows: FloatArray) -> bool:
     """Return whether the sums are more than the freedoms at home, where they contradict each other
     by their errors, for closure rows (c, M + J). Refuse sums that leave the platform free.
     """
-    weights = robot.slots(robot.values[None])[1].weights
+    weights = robot.present[1].weights
     assert weights is not None
     units = measure_sums(robot, weights)[:, None]
     sums = np.pad(weights[0] * units, [(0, 0), (rows.shape[1] - weights.shape[2], 0)])

@@ -402,7 +402,22 @@ class Mechanism(DrawnResult):
         chosen = self.independent
         return None if chosen is None or len(chosen) == len(self.actuators) else chosen
 
-    @property
+    @cached_property
+    def present(self) -> tuple[FloatArray, Transmissions]:
+        """Displacements and transmissions at the present values."""
+        return self.slots(self.values[None])
+
+    @cached_property
+    def present_stages(self) -> tuple[Mechanism, ...]:
+        """The stages of a chain, each alone at its present values."""
+        return tuple(s.robot.with_values(self.values[s.parameters]) for s in self.stages)
+
+    @cached_property
+    def derived(self) -> dict[str, Any]:
+        """What functions have derived from this robot alone, for their next calls, by name."""
+        return {}
+
+    @cached_property
     def exact(self) -> Mechanism:
         """The same robot with loops that close exactly and redundant readings that follow them."""
         if self.stages:
@@ -465,12 +480,6 @@ class Mechanism(DrawnResult):
         rows, readings = self.assembly.rows, len(self.assembly.rows) - len(self.assembly.couplings)
         is_square = self.program.n_joints == len(rows) and readings <= len(self.freedoms)
         return self.has_sums and not self.stages and not is_square
-
-    def are_joints(self, weights: FloatArray) -> bool:
-        """Return whether sums of weights (t | 1, r, J) determine the driven joints, whatever the
-        loops.
-        """
-        return weights.shape[1] == self.program.n_joints and not self.has_open_sums
 
     @property
     def has_redundant_sums(self) -> bool:

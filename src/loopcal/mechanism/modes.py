@@ -178,7 +178,7 @@ def _subtract_turns(robot: Mechanism, state: State) -> State:
             for a in robot.actuators
         ]
     )
-    _, drives = robot.slots(robot.values[None])
+    _, drives = robot.present
     center = drives.find_joints(middle[None, None])[0, 0]
     driven = driven_values(robot.program, state)
     turns = np.round((driven - center) / (2 * np.pi))

@@ -101,34 +101,27 @@ def compare_coordinates(
     """
     residual = np.zeros(target.shape)
     columns = np.zeros((*target.shape, 6))
-    for i, name in enumerate(names):
-        if name in POSITION:
-            axis = POSITION.index(name)
-            residual[:, i] = T[:, axis, 3] - target[:, i]
-            columns[:, i, 3 + axis] = 1.0
-    rotation, wanted = T[:, :3, :3], {name: target[:, i] for i, name in enumerate(names)}
-    if "phi" in wanted:
-        places = [names.index("phi"), names.index("theta")]
-        residual[:, places], columns[:, places, :3] = _compare_normals(
-            rotation, wanted["phi"], wanted["theta"], size
-        )
-    if "psi" in wanted:
+    at = [i for i, name in enumerate(names) if name in POSITION]
+    axes = np.array([POSITION.index(names[i]) for i in at], int)
+    residual[:, at], columns[:, at, 3 + axes] = T[:, axes, 3] - target[:, at], 1.0
+    rotation = T[:, :3, :3]
+    if "phi" in names:
+        at = [names.index("phi"), names.index("theta")]
+        wanted = target[:, at[0]], target[:, at[1]]
+        residual[:, at], columns[:, at, :3] = _compare_normals(rotation, *wanted, size)
+    if "psi" in names:
         place, normal = names.index("psi"), rotation[:, :, 2]
         angle = geometry.matrix_to_tilt_torsion(rotation)[..., 2]
-        residual[:, place] = size * geometry.wrap_angle(angle - wanted["psi"])
+        residual[:, place] = size * geometry.wrap_angle(angle - target[:, place])
         # d psi = (ez + n) . omega / (1 + cos theta): orthogonal to the axes that phi and theta turn
         # about. Upside down torsion has no meaning, and no slope
         left = 1.0 + normal[:, 2:]
         inverse = np.divide(size, left, out=np.zeros_like(left), where=left > 0.0)
         columns[:, place, :3] = (normal + np.eye(3)[2]) * inverse
-    if set(EULER) & set(names):
-        angles = geometry.matrix_to_euler(rotation, "xyz")
-        rates = geometry.euler_rates_inverse(angles, "xyz")
-        for i, name in enumerate(EULER):
-            if name in wanted:
-                place = names.index(name)
-                residual[:, place] = size * geometry.wrap_angle(angles[:, i] - wanted[name])
-                columns[:, place, :3] = size * rates[:, i]
+    if at := [i for i, name in enumerate(names) if name in EULER]:
+        own, angles = [EULER.index(names[i]) for i in at], geometry.matrix_to_euler(rotation, "xyz")
+        residual[:, at] = size * geometry.wrap_angle(angles[:, own] - target[:, at])
+        columns[:, at, :3] = size * geometry.euler_rates_inverse(angles, "xyz")[:, own]
     return residual, columns
 
 

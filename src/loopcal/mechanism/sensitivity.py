@@ -36,7 +36,6 @@ from loopcal.mechanism.least_squares_closure import (
 from loopcal.mechanism.limb_rows import move_passive_joints, name_entries, name_passive_joints
 from loopcal.mechanism.model import Mechanism, ParameterUnits
 from loopcal.mechanism.states import is_closed
-from loopcal.mechanism.transmission import apply_weights, invert_weights
 from loopcal.typing import BoolArray, FloatArray
 
 
@@ -136,11 +135,6 @@ def differentiate_by_drives(
     """Return twists (t, n, 6, u) per unit of driven joints u (t, n, u), or (t, n, 6, r) of their
     sums with `weights` (t | 1, r, J), of a robot without stages at displacements e (t | 1, d).
     """
-    if weights is not None and robot.are_joints(weights):
-        inverse = invert_weights(weights)
-        joints = apply_weights(inverse, u)
-        by_joints = differentiate_by_drives(robot, e, joints, state, None)
-        return np.matmul(by_joints, inverse[:, None])
     if weights is None:
         return engine.differentiate(robot.program, e, u, state, robot.program.drive_map)[1]
     return spread_twists(robot.program, differentiate_unknowns_by_sums(robot, e, state, weights))

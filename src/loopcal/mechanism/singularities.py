@@ -272,14 +272,13 @@ def _scale_closure(robot: Mechanism, state: State) -> tuple[FloatArray, FloatArr
     program, blocks = robot.program, linearize_state(robot, state)
     A, Q = (rows[0] for rows in reduce_to_platform(program, blocks))
     if robot.has_sums:
-        e, drives = robot.slots(robot.values[None])
+        e, drives = robot.present
         weights, chosen = drives.weights, ~drives.fixed_rows  # sums of commanded readings
         assert weights is not None
         if robot.has_open_sums:  # dy/ds^+ dy - ds = 0
             moved = differentiate_unknowns_by_sums(robot, e, state, weights)[0]
-            A = np.linalg.pinv(
-                np.nan_to_num(moved[:, : A.shape[2], chosen], posinf=0.0, neginf=0.0)
-            )
+            own = moved[:, : A.shape[2], chosen]
+            A = np.linalg.pinv(np.nan_to_num(own, posinf=0.0, neginf=0.0))
             Q = np.tile(-np.eye(A.shape[1]), (len(A), 1, 1))
         else:
             Q = np.matmul(Q, invert_weights(weights))[..., chosen]

@@ -70,7 +70,7 @@ Step = Callable[[IntArray, FloatArray, State], State]
 
 def contracts(robot: Mechanism, start: State, end: State) -> BoolArray:
     """Return which steps (n,) between states (1, n | 1) and (1, n) Newton's method makes safely."""
-    e, _ = robot.slots(robot.values[None])
+    e, _ = robot.present
     joints, whole = driven_values(robot.program, end), measure_distance(robot, start, end)
     rows, done = np.arange(len(whole)), 0
     safe, current = np.zeros(len(whole), bool), start
@@ -108,7 +108,7 @@ def repeat_poses(state: State, n: int) -> State:
 
 def _move_readings(robot: Mechanism, first: State, last: State) -> Step:
     """Return the steps along straight paths of joint values between states (1, k)."""
-    e, _ = robot.slots(robot.values[None])
+    e, _ = robot.present
     origin, target = driven_values(robot.program, first), driven_values(robot.program, last)
 
     def step(rows: IntArray, share: FloatArray, current: State) -> State:
@@ -166,7 +166,8 @@ SAME_POSE = 1e-7
 Rounding grows close to a singularity, up to the square root of the machine precision.
 """
 
-Solver = Callable[[FloatArray, State | None], tuple[State, BoolArray | None]]
+Arrives = BoolArray | None
+Solver = Callable[[FloatArray, State | None], tuple[State, Arrives]]
 """Solves inverse kinematics for targets (n, ..) from a start: states (1, n), and where the engine
 tells, which of them their readings are known to lead to, see `reach_coordinates`."""
 
@@ -184,13 +185,11 @@ def solve_in_mode(
     rows = np.flatnonzero(is_other)
     if not len(rows):
         return state
-    status = np.where(is_other, np.int8(Status.OTHER_MODE), state.status)
-    state = replace(state, status=status)
+    state = replace(state, status=np.where(is_other, np.int8(Status.OTHER_MODE), state.status))
     if has_one_solution(robot) or moves_by_drives(robot):  # which follows the path itself
         return state
     begin = select_poses(repeat_poses(begin, len(is_other)), rows)
-    path = _move_poses(robot, begin, select_poses(state, rows))
-    near, arrived = _follow_path(robot, begin, path)
+    near, arrived = _follow_path(robot, begin, _move_poses(robot, begin, select_poses(state, rows)))
     begin, rows = select_poses(begin, arrived), rows[arrived]
     if not len(rows):
         return state
@@ -211,7 +210,7 @@ def compute_bend(robot: Mechanism, state: State) -> NDArray[np.int8]:
     """Return the sign (n,) of the determinant of the limbs at their platform, every joint free: it
     changes where a limb is stretched or folded, from one working mode to another.
     """
-    e, _ = robot.slots(robot.values[None])
+    e, _ = robot.present
     limbs, joints = robot.program.with_fixed_platform, driven_values(robot.program, state)
     return engine.solve(limbs, e, joints, state, free=True, max_iterations=0).closure_sign[0]
 
@@ -225,8 +224,7 @@ def reach_coordinates(
     pose; where these are not None, the states have closure signs.
     """
     values, target = robot.values[None], target[None]
-    is_plain = not (robot.is_serial or moves_by_drives(robot))
-    is_plain &= not robot.program.idle_groups
+    is_plain = not (robot.is_serial or moves_by_drives(robot) or robot.program.idle_groups)
     if not (is_plain and robot.program.is_square and target.shape[1] and determine_platform(robot)):
         return close_at_coordinates(robot, values, target, start), None
     e, _ = robot.slots(values)
@@ -236,12 +234,13 @@ def reach_coordinates(
 
 
 def judge_modes(
-    robot: Mechanism, state: State, begin: State, arrives: BoolArray | None = None
+    robot: Mechanism, state: State, begin: State, arrives: Arrives = None, has_signs: bool = False
 ) -> tuple[State, BoolArray]:
     """Return a state (1, n) with closure signs, and its closed rows that `begin` does not lead to.
 
     arrives : as of `reach_coordinates`. The engine proves most rows. For the others the sign is
-    computed, and those of the right sign are solved by forward kinematics up to their pose.
+    computed, unless the state has it, and those of the right sign are solved by forward kinematics
+    up to their pose.
     """
     if robot.stages:
         return _judge_stages(robot, state, begin)
@@ -254,10 +253,12 @@ def judge_modes(
     else:
         sign = np.zeros(n, np.int8)
         if not robot.has_open_sums:
-            e, _ = robot.slots(robot.values[None])
+            e, _ = robot.present
             sign = engine.certify(robot.program, e, begin, state)[0]
         is_sure = sign != 0
-        if not is_sure.all():
+        if has_signs or moves_by_drives(robot):
+            sign = np.where(is_sure, sign, state.closure_sign[0])
+        elif not is_sure.all():
             unsure = select_poses(state, ~is_sure)
             sign[~is_sure] = compute_closure_sign(robot, robot.values[None], unsure)[0]
         state = replace(state, closure_sign=sign[None])
@@ -279,10 +280,9 @@ def judge_modes(
 def _judge_stages(robot: Mechanism, state: State, begin: State) -> tuple[State, BoolArray]:
     """Return what `judge_modes` returns, of a chain: another mode is one of any of its stages."""
     is_other, signs = np.zeros(state.T.shape[1], bool), list[NDArray[np.int8]]()
-    parts = robot.stages, split_stage_states(robot, state), split_stage_states(robot, begin)
-    for stage, own, first in zip(*parts, strict=True):
-        machine = stage.robot.with_values(robot.values[stage.parameters])
-        part, is_part_other = judge_modes(machine, own, first)
+    parts = split_stage_states(robot, state), split_stage_states(robot, begin)
+    for machine, own, first in zip(robot.present_stages, *parts, strict=True):
+        part, is_part_other = judge_modes(machine, own, first, has_signs=True)
         signs.append(part.closure_sign)
         is_other |= is_part_other
     whole = np.multiply.reduce(signs, dtype=np.int8)
@@ -296,10 +296,12 @@ def _judge_paths(robot: Mechanism, first: State, goal: State) -> tuple[State, Bo
     Newton's method must lead to the pose of a goal from its readings, and a safe path too, where
     readings determine the joints.
     """
-    loops = Loops.place(robot, robot.values[None])
+    loops = Loops.place(robot)
     back = loops.close(loops.read(goal), first, goal=goal)
     is_other = back.status[0] != NEAR_GOAL
-    is_other &= (back.status[0] != Status.CONVERGED) | ~_is_same_pose(robot, back, goal, SAME_POSE)
+    if is_other.any():
+        is_same = _is_same_pose(robot, back, goal, SAME_POSE)
+        is_other &= (back.status[0] != Status.CONVERGED) | ~is_same
     rows = np.flatnonzero(~is_other & (loops.weights is None))
     start = repeat_poses(first, len(is_other))
     rows = rows[~contracts(robot, select_poses(start, rows), select_poses(goal, rows))]

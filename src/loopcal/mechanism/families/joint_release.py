@@ -123,8 +123,7 @@ def _list_candidates(robot: Mechanism, record: Limbs) -> Iterator[AddedJoint]:
                 works = []
                 for i in members:
                     own = robot.assembly.limbs[i].joints[element]
-                    motion = np.array(values[i][element]), np.array(own.pitch)
-                    T = frames[i][0, 0, element] @ move_joint(own.kind, *motion)
+                    T = frames[i][0, 0, element] @ move_joint(own, values[i][element])
                     u = T[:3, :3] @ carried @ axis_vector(added.axis)
                     twist = np.concatenate([np.zeros(3), u])
                     if added.joint == "R":

@@ -341,8 +341,7 @@ def follow_rigid_limbs(known: dict[str, FloatArray], limbs: Sequence[Limb]) -> N
             if limb.ending == "rigid" and (limb.on in known) != (limb.to in known):
                 step = limb.links[0].transform
                 for joint, link in zip(limb.joints, limb.links[1:], strict=True):
-                    at_start = np.array(joint.start), np.array(joint.pitch)
-                    step = step @ move_joint(joint.kind, *at_start) @ link.transform
+                    step = step @ move_joint(joint, joint.start) @ link.transform
                 step = step @ invert_pose(limb.attachment.transform)
                 if limb.on in known:
                     known[limb.to] = known[limb.on] @ step
