@@ -148,3 +148,8 @@ def test_fit_that_leads_away_from_a_geometry_without_poses_is_not_called_a_failu
     second = calibrate(lc.load_robot(tmp_path / "corrected.yaml"), data, options)
     assert second.fitted_errors is not None
     assert len(second.fitted_errors.poses) == 12
+
+
+def test_outliers_of_a_failed_fit_are_refused():
+    with pytest.raises(lc.EstimationError, match="did not converge"):
+        lc.find_outliers(failed().identification, wrong_data())

@@ -167,6 +167,17 @@ def test_rows_that_agree_are_used_although_they_do_not_fit() -> None:
     assert state.scale > 10.0  # the contradiction widens all standard deviations
 
 
+def test_rows_in_another_unit_are_named_and_not_used() -> None:
+    machine = Machine("linear-delta", (), 1)
+    poses = [machine.fit[0]] * 2
+    exact = machine.exact.observations[0].measured[poses]
+    state, verdicts = follow(machine, poses, dict(enumerate(-0.999 * exact)))
+    assert [verdict.judgement for verdict in verdicts] == ["repeat", "misread"]
+    assert verdicts[1].findings[1].code == "conventions.undecided"
+    assert not state.is_used.any()
+    assert state.pending == (machine.fit[0],)
+
+
 def test_rows_that_contradict_each_other_are_measured_again() -> None:
     wrong = {6: (1e-3, 0.0, 0.0), 7: (0.0, 1e-3, 0.0)}
     machine = make_machine()

@@ -28,7 +28,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from loopcal.errors import LoopcalError
+from loopcal.errors import EstimationError, LoopcalError
 from loopcal.estimate.fit_descent import estimate_scale_of, measure_block_distances
 from loopcal.estimate.identification import identify, prepare_fitted_data
 from loopcal.estimate.linearization import LeverageRows, Linearization, PoseSolution, Start
@@ -563,7 +563,11 @@ def find_outliers(
     fit : the identification, with or without a loss. data : the measurements it was made from.
     level : probability of naming any block where none is wrong.
     progress : receives the rounds of the search.
+
+    EstimationError : the fit did not converge.
     """
+    if not fit.converged:
+        raise EstimationError.of("sampling.not-converged")
     data = prepare_fitted_data(fit, data)
     problem = problem_of(fit.free_parameters, data, fit.options.nuisance)
     member = np.unique(linked_blocks(data), return_inverse=True)[1]

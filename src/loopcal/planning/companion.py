@@ -30,6 +30,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from loopcal.diagnose.conventions.convention_check import compare_conventions
 from loopcal.errors import DataError
 from loopcal.estimate.information import ObservedPoses, observe_poses, observe_rows
 from loopcal.estimate.residual_test import FEWEST_DEGREES, NO_NOISE, SIGNIFICANCE
@@ -320,7 +321,9 @@ def _locate_setup(task: CompanionTask, measured: Measurements, x: FloatArray) ->
 
 # What a new row says.
 
-Judgement = Literal["fits", "untestable", "repeat", "earlier-wrong", "agree", "differ", "moved"]
+Judgement = Literal[
+    "fits", "untestable", "repeat", "earlier-wrong", "agree", "differ", "moved", "misread"
+]
 
 
 class Prediction(NamedTuple):
@@ -420,9 +423,9 @@ def examine_row(before: Companion, measured: Measurements, pose: int) -> Verdict
     same = [i for i in range(n - 1) if poses[i] == pose]
     doubted = [i for i in same if not used[i]]
 
-    def conclude(judgement: Judgement, **more: Any) -> Verdict:
-        finding = report_finding(f"companion.{judgement}", **data, **more)
-        return Verdict(judgement, prediction, expected, used, (finding,))
+    def conclude(judgement: Judgement, *others: Finding, **more: Any) -> Verdict:
+        said = (report_finding(f"companion.{judgement}", **data, **more), *others)
+        return Verdict(judgement, prediction, expected, used, said)
 
     def conclude_drift(since: int, new: list[int]) -> Verdict:
         if find_suspects(fit, fitted, new) == [since]:  # all other rows contradict it, too
@@ -460,7 +463,12 @@ def examine_row(before: Companion, measured: Measurements, pose: int) -> Verdict
         used[suspects] = False
     if suspects:
         return conclude("earlier-wrong", suspects=tuple(task.labels[poses[i]] for i in suspects))
-    return conclude("agree")
+    check = compare_conventions(task.robot, measured.take(used))
+    others = () if check.finding is None else (check.finding,)
+    if check.is_refused or (others and not before.is_used.any()):  # such as another unit
+        used[[*same, n - 1]] = False
+        return conclude("misread", *others)
+    return conclude("agree", *others)
 
 
 def take_rows(
