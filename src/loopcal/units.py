@@ -277,6 +277,22 @@ def parse_goal(text: str) -> tuple[float, str]:
         raise UnitError(f"{error}, or give an angle, such as 10urad") from None
 
 
+def scale(value: float, factor: float) -> float:
+    """Return a number times a factor: 1e-3 is a division by 1000, which rounds once."""
+    divisor = round(1.0 / factor)
+    return value / divisor if divisor * factor == 1.0 else value * factor
+
+
+def format_scaled(value: float, factor: float) -> str:
+    """Return value / factor with the fewest digits whose double `scale` makes `value` again, with
+    `factor` (SI per unit); all 17 digits where no shorter text returns it.
+    """
+    divisor = round(1.0 / factor)
+    scaled = value * divisor if divisor * factor == 1.0 else value / factor
+    texts = (f"{scaled:.{digits}g}" for digits in (15, 16, 17))
+    return next((t for t in texts if scale(float(t), factor) == value), repr(float(scaled)))
+
+
 def to_si(value: float, unit: Unit) -> float:
     """Return a finite number in SI.
 
@@ -290,7 +306,7 @@ def to_si(value: float, unit: Unit) -> float:
             f"{shown} {unit} exceeds {LARGEST:g} {SI_SYMBOLS[unit.dimension]}. Write a number "
             "that a machine can have"
         )
-    si = value * unit.factor_to_si + unit.offset
+    si = scale(value, unit.factor_to_si) + unit.offset
     if unit.offset and si < ABSOLUTE_ZERO - ROUNDING:
         raise UnitError(f"{value:g} {unit} is below absolute zero. Correct it")
     return si

@@ -412,7 +412,7 @@ def test_simulate_draws_a_scale_and_states_it_in_files_that_it_fills_in_too(
     assert abs(drawn[0] - drawn[1]) > 1e-6
     for data in (scaled, filled):
         (stated,) = data.stated_values
-        assert (stated.name, stated.sd) == ("position.scale", 100 * 1e-6)
+        assert (stated.name, stated.sd) == ("position.scale", 1e-4)
     loopcal(
         "simulate core-xy --kind inclination --sigma-scale 2ppm -o x.csv",
         "measures angles, which have no scale",

@@ -11,6 +11,7 @@ import pytest
 import loopcal as lc
 from loopcal.cli.entry_point import find_command
 from loopcal.io.formats import FORMATS
+from loopcal.units import find_unit, to_si
 from tests.cli.delta_printers import list_stored_geometry, read_records
 from tests.io.formats.linkages.test_urdf_closures import FIVE_BAR
 from tests.io.formats.printers import format_printer_cfg
@@ -138,9 +139,8 @@ def test_exported_json_and_csv_contain_every_parameter_with_its_interval(
     csv_rows = (folder / "found.csv").read_text().splitlines()
     assert csv_rows[0] == "name,nominal,value,plus_minus,unit,free"
     for row, line, value in zip(document["parameters"], csv_rows[1:], robot.values, strict=True):
-        factor = np.pi / 180 if row["unit"] == "deg" else 1e-3
-        assert row["value"] * factor == value
-        assert float(line.split(",")[2]) * factor == value
+        unit = find_unit(row["unit"])
+        assert to_si(row["value"], unit) == to_si(float(line.split(",")[2]), unit) == value
         assert row["plus_minus"] == half.get(row["name"])
         assert row["free"] == (row["name"] in half)
 

@@ -12,7 +12,6 @@ from loopcal.cli.entry_point import main
 from loopcal.errors import FileError, UnitError
 from loopcal.io.core.csv_table import (
     format_exact,
-    format_scaled,
     parse_decimals,
     parse_exact,
     parse_finite,
@@ -21,7 +20,7 @@ from loopcal.io.core.csv_table import (
 from loopcal.io.data.measurement_file import save_measurements
 from loopcal.io.robot.robot_file import load_robot, save_robot
 from loopcal.measure.simulation import sample_truth
-from loopcal.units import Dimension, parse_number, parse_quantity
+from loopcal.units import UNITS, Dimension, format_scaled, parse_number, parse_quantity
 from tests.io.test_measurement_columns import draw_measurements
 
 FACTORS = (1.0, 1e-3, 1e-6, 1e-9, 0.0254, np.pi / 180, np.pi / 10800, np.pi / 648000)
@@ -62,6 +61,18 @@ def test_rounding_through_a_double_needs_no_further_digits() -> None:
     text = format_exact(value, arcsec)  # the double nearest to the quotient reads back as another
     assert text == "-45398.274095481062"
     assert parse_exact(text, arcsec) == value
+
+
+@pytest.mark.parametrize("symbol", [s for s, unit in UNITS.items() if unit.factor_to_si < 1.0])
+def test_a_quantity_of_few_digits_is_written_as_it_was_read(symbol) -> None:
+    """0.1 is 100000 ppm, not 100000.00000000001 ppm: `simple` is the nearest double to it."""
+    factor = UNITS[symbol].factor_to_si
+    for simple in (100_000.0, *(float(k) for k in range(1, 2000)), 0.07, 0.035, 1.15):
+        value = parse_quantity(f"{simple!r} {symbol}", is_difference=True)
+        assert float(format_scaled(value, factor)) == simple
+    if symbol in ("mm", "um", "nm", "mrad", "urad", "ppm", "um/m"):
+        clean = (format_scaled(float(f"{k}e-3"), factor) for k in range(1, 2000))
+        assert max(map(count_digits, clean)) <= 4  # 17 of two in seven, by a product with 1e-6
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -73,15 +73,6 @@ def _as_decimal(factor: float) -> Decimal:
     return Decimal(repr(factor)).normalize()
 
 
-def format_scaled(value: float, factor: float) -> str:
-    """Return value / factor with the fewest digits whose double times `factor` (SI per unit) is
-    `value` again; all 17 digits where no shorter text returns it.
-    """
-    scaled = value / factor
-    texts = (f"{scaled:.{digits}g}" for digits in DIGITS)
-    return next((text for text in texts if float(text) * factor == value), repr(float(scaled)))
-
-
 def format_exact(value: float, factor: float) -> str:
     """Return the shortest text (up to 17 digits) from which `parse_exact` makes the same double.
 

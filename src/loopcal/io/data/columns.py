@@ -106,7 +106,7 @@ class NumberColumn(Column):
             raise table.header_error(sentence)
         units = map(table.unit, [self.name] * len(symbols), dimensions, map(str.strip, symbols))
         factor = math.prod(unit.factor_to_si for unit in units)
-        return table.scaled_numbers(self.name, 1.0, empty=not dimensions) * factor
+        return table.scaled_numbers(self.name, factor, empty=not dimensions)
 
     def format(self, value: Any) -> str:
         """Return a number [SI] in the unit; nothing for NaN."""
@@ -118,8 +118,7 @@ class NumberColumn(Column):
         if not self.symbols:
             return f"{number:g}"
         factor = math.prod(find_unit(symbol).factor_to_si for symbol in self.symbols)
-        write = csv_table.format_exact if len(self.symbols) == 1 else csv_table.format_scaled
-        return write(number, factor)
+        return csv_table.format_exact(number, factor)
 
 
 @dataclass(frozen=True)

@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 from loopcal import geometry
 from loopcal.errors import DataError, suggest_names
 from loopcal.findings import report_finding
-from loopcal.io.core.csv_table import Places, Table, format_scaled, require_columns
+from loopcal.io.core.csv_table import Places, Table, require_columns
 from loopcal.io.core.records import get_field_types, read_record
 from loopcal.io.core.text_file import name_files
 from loopcal.io.core.yaml_file import Location, YamlFile, refuse_unknown_keys
@@ -73,6 +73,8 @@ from loopcal.units import (
     Temperature,
     Unit,
     find_sd_fault,
+    format_scaled,
+    scale,
 )
 
 DIRECTIONS = ("along", "axis", "normal", "up")
@@ -277,7 +279,7 @@ def describe_quantity(value: float, dimension: Dimension, unit: Unit | None = No
         return value
     shown = unit or DISPLAY_UNITS[dimension]
     text = format_scaled(value, shown.factor_to_si)
-    if float(text) * shown.factor_to_si == value:
+    if scale(float(text), shown.factor_to_si) == value:
         return f"{text} {shown.symbol}"
     return f"{value!r} {SI_SYMBOLS[dimension]}"
 

@@ -21,7 +21,7 @@ import regex
 
 from loopcal.errors import FileError, UnitError, suggest_names
 from loopcal.findings import report_finding
-from loopcal.io.core.csv_table import format_scaled, parse_finite
+from loopcal.io.core.csv_table import parse_finite
 from loopcal.io.core.limits import PATTERN_COUNTS, PATTERN_LENGTH, PATTERN_SECONDS
 from loopcal.io.core.records import read_record
 from loopcal.io.core.text_file import as_path
@@ -41,7 +41,7 @@ from loopcal.io.data.kind_settings import POSE_SETTINGS, SETTINGS, list_kind_set
 from loopcal.io.robot.robot_file import check_format
 from loopcal.measure.kinds.kind import Kind
 from loopcal.plain_text import quote
-from loopcal.units import UNITS, Dimension, find_unit, list_symbols, parse_quantity
+from loopcal.units import UNITS, Dimension, find_unit, format_scaled, list_symbols, parse_quantity
 
 # Regular expressions of users, with a limit on their time.
 

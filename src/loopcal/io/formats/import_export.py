@@ -16,7 +16,7 @@ from typing import Any, Literal
 
 from loopcal.errors import DataError, FileError, MechanismError
 from loopcal.findings import Finding, Severity, report_finding
-from loopcal.io.core.csv_table import format_columns, format_scaled
+from loopcal.io.core.csv_table import format_columns
 from loopcal.io.core.text_file import read_text, write_text
 from loopcal.io.core.yaml_file import parse_yaml
 from loopcal.io.data.measurement_file import save_measurements
@@ -26,7 +26,7 @@ from loopcal.io.formats.program_format import Exported, ExportSource, Format, Im
 from loopcal.io.robot.robot_file import build_robot, load_robot
 from loopcal.io.runs.run_folder import Run
 from loopcal.mechanism.model import Mechanism
-from loopcal.units import find_unit
+from loopcal.units import find_unit, format_scaled
 
 APPLY = "values.apply"  # begin of the codes of recommendations to use the values
 

@@ -28,7 +28,6 @@ import numpy as np
 
 from loopcal.errors import DataError, FileError
 from loopcal.findings import Finding, report_finding
-from loopcal.io.core.csv_table import format_scaled
 from loopcal.io.core.yaml_file import format_yaml
 from loopcal.io.formats.program_format import (
     DECIMALS,
@@ -46,7 +45,7 @@ from loopcal.io.formats.program_format import (
 from loopcal.mechanism.families.gough import Gough
 from loopcal.mechanism.families.records import values_per_leg
 from loopcal.typing import FloatArray
-from loopcal.units import Dimension, find_unit
+from loopcal.units import Dimension, find_unit, format_scaled
 
 COMPONENT = "genhexkins"
 LEAD, OFFSETS = "screw-lead", ("spindle-offset", "tool-offset")

@@ -28,7 +28,6 @@ from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_ori
 import numpy as np
 
 from loopcal.errors import DataError, FileError, MechanismError, UnitError, suggest_names
-from loopcal.io.core.csv_table import format_scaled
 from loopcal.io.core.records import Units, get_field_types, read_record, read_units
 from loopcal.io.core.text_file import as_path, name_files, write_text
 from loopcal.io.core.yaml_file import (
@@ -47,7 +46,7 @@ from loopcal.mechanism.families.placement import RecordError
 from loopcal.mechanism.families.records import RobotRecord
 from loopcal.mechanism.model import Mechanism
 from loopcal.typing import FloatArray
-from loopcal.units import Dimension, find_unit, to_si
+from loopcal.units import Dimension, find_unit, format_scaled, to_si
 
 # The `identified:` table of a corrected robot file: values of parameters.
 

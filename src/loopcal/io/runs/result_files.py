@@ -23,6 +23,7 @@ from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import get_dimension
 from loopcal.plain_text import escape_formula
 from loopcal.typing import FloatArray
+from loopcal.units import format_scaled
 
 if TYPE_CHECKING:
     from loopcal.apply.compensation import Compensation
@@ -114,5 +115,5 @@ def format_draws(
     if weight is not None:
         columns["weight"] = map(repr, weight.tolist())
     for name, unit, factor, column in zip(names, units, factors, draws.T.tolist(), strict=True):
-        columns[f"{name} [{unit}]"] = [csv_table.format_scaled(value, factor) for value in column]
+        columns[f"{name} [{unit}]"] = [format_scaled(value, factor) for value in column]
     return csv_table.format_columns(columns)

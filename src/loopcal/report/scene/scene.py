@@ -447,10 +447,10 @@ def _list_names(robot: Mechanism, parts: tuple[Part, ...], unit: Unit) -> list[d
     feet = zip(robot.assembly.limbs, parts, strict=False)
     marks = [(limb.name, describe_part(part)["color"], part.points[0, 0]) for limb, part in feet]
     axes = (part.points[0, 1] for part in parts if part.role == "frame")
-    names = "xy" if is_planar(robot) else "xyz"
+    names, factor = "xy" if is_planar(robot) else "xyz", unit.factor_to_si
     marks += zip(names, FRAME_COLORS, axes, strict=False)
     return [
-        {"text": escape(name), "color": color, "point": (place / unit.factor_to_si).tolist()}
+        {"text": escape(name), "color": color, "point": np.round(place / factor, 6).tolist()}
         for name, color, place in marks
     ]
 
@@ -556,7 +556,7 @@ def draw_robot(robot: Mechanism) -> Figure:
     everything = np.concatenate([points for points, _ in strokes])
     low, high = everything.min(axis=0), everything.max(axis=0)
     is_flat, shown = is_planar(robot), [*choose_view(robot)]
-    figure = start_figure(7.0 if is_flat else 11.8, 6.4 if is_flat else 6.0)
+    figure = start_figure(6.2 if is_flat else 9.8, 5.6 if is_flat else 5.0)
     space: Any = None if is_flat else figure.add_subplot(1, 2, 1, projection="3d")
     above: Any = figure.add_subplot() if is_flat else figure.add_subplot(1, 2, 2)
     panels = [(above, shown)] + ([] if space is None else [(space, [0, 1, 2])])
