@@ -89,6 +89,7 @@ def test_a_configuration_of_several_files_is_corrected(tmp_path, robots) -> None
             "M669 K6 N4 A0:1 B1:1:1 C1:1:1 D0:0:2\n",
             "A of M669 has 2 numbers, but must have 3",
         ),
+        ("a.g", "M669 K6 N3 A0:1:1 B1:1:1 C1:1:1\nM666 R7:7:7\n", "M666 needs positive R, U"),
         ("a.g", "M669 K6 N9\n", "Write a number of 3 to 8 lines"),
     ],
 )

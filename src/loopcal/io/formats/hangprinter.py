@@ -131,11 +131,10 @@ def read_config(file: ValueFile, options: ImportOptions) -> Imported:
     if not FREEDOMS <= lines <= len(ANCHORS_OF_FIRMWARE):
         raise file.error(f"N is {lines}. Write a number of 3 to 8 lines", "M669", "N")
     anchors = np.array([list_numbers("M669", name, 3) for name in ANCHORS_OF_FIRMWARE[:lines]])
-    radius, advantage, per_spool, motor, spool = (
-        np.array(list_numbers("M666", letter, lines)) for letter in "RUOLH"
-    )
-    if not (np.array([radius, advantage, per_spool, motor, spool]) > 0).all():
-        raise file.error("R, U, O, L and H of M666 must be positive. Correct them", "M666", "R")
+    found = [list_numbers("M666", x, lines) for x in "RUOLH" if file.has("M666", x)]
+    if len(found) < 5 or not (np.array(found) > 0).all():
+        raise file.error("M666 needs positive R, U, O, L and H of each line. Add them", "M666", "R")
+    radius, advantage, per_spool, motor, spool = np.array(found)
     gear, nothing = float(motor[0] / spool[0]), np.full(lines, np.nan)
     spools = (radius * motor / spool / gear, advantage, per_spool, gear)
     samples = Samples(*spools, np.zeros((0, lines)), np.zeros((0, 3)), anchors, nothing, ())

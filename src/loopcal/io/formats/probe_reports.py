@@ -58,8 +58,8 @@ HEIGHT_MAP = "RepRapFirmware height map file"
 DATE = re.compile(r"(?<!\d)20\d\d-\d\d-\d\d(?!\d)(?: \d\d:\d\d)?")
 # What only an answer of a firmware contains, not the macro or the configuration beside it.
 ANSWER = re.compile(rf"Bed X:|bed probe heights:|Stopped at height|{HEIGHT_MAP}", re.IGNORECASE)
-# Command that states where the probe is beside the nozzle, and the height at which it triggers.
-OFFSETS = {"marlin": re.compile(r"\bM851\b(.*)"), "reprap": re.compile(r"\bG31\b(.*)")}
+# Commands that state the geometry, and where the probe is beside the nozzle when it triggers.
+OFFSETS = {"marlin": "M851", "reprap": "G31"}
 # Median deviation of heights from their median [mm]: beyond these, another unit is possible, sure.
 UNEVEN, ROUGH = 1.0, 5.0
 # Median height [mm] from which a wrong trigger height is as probable as wrong end stops, and beyond
@@ -90,8 +90,9 @@ def import_probes(
     FileError : no heights, a report that cannot be used, or a point out of reach.
     """
     first = options.probes[0]
-    probe = _read_probe((path, *options.probes), firmware)
+    probe, differing = _read_settings((path, *options.probes), firmware)
     points, noted = read_reports(options.probes, firmware, probe)
+    noted += differing
     if len(points) < FEWEST:
         raise FileError.of("files.probes-too-few", first, count=len(points), least=FEWEST)
     heights = np.array([p.height for p in points])
@@ -99,8 +100,7 @@ def import_probes(
     reports = (read_text(file, "probe report") for file in options.probes)
     probed = max(_list_times(reports), default="")
     if probed and stored[: len(probed)] > probed[: len(stored)]:
-        facts = {"stored": stored, "probed": probed}
-        noted.append(report_finding("files.configuration-later", **facts))
+        noted.append(report_finding("files.configuration-later", stored=stored, probed=probed))
     noted += check_heights(heights, probe.get("Z"), firmware, first)
     noted += _compare_repeats(points, options.choose_noise("height") / MM)
     names = [p.name for p in points]
@@ -136,8 +136,8 @@ def read_reports(
     missing = tuple(letter for letter in "XY" if letter not in probe)
     x, y = probe.get("X", 0.0), probe.get("Y", 0.0)
     if probed and missing:
-        facts = {"letters": missing, "firmware": firmware}
-        noted.append(report_finding("files.probe-place-assumed", **facts))
+        finding = report_finding("files.probe-place-assumed", letters=missing, firmware=firmware)
+        noted.append(finding)
     elif probed and (x or y):
         facts = {"x": Quantity(x, "mm"), "y": Quantity(y, "mm"), "firmware": firmware}
         noted.append(report_finding("files.probe-place", **facts))
@@ -156,16 +156,22 @@ def _list_times(reports: Iterable[str]) -> list[str]:
     return [time for text in answers for time in DATE.findall(text)]
 
 
-def _read_probe(paths: Sequence[Path], firmware: str) -> dict[str, float]:
-    """Return what the files state of the probe: X, Y beside the nozzle, and Z [mm]."""
-    stated: dict[str, float] = {}
-    for file in paths:
-        for i, line in enumerate(read_text(file, "G-code file").splitlines(), 1):
-            if match := OFFSETS[firmware].search(line.partition(";")[0].upper()):
-                for letter in "XYZ":
-                    if word := re.search(rf"{letter}\s*{NUMBER}", match[1]):
-                        stated[letter] = parse_number(word[1], f"{letter} of the probe", file, i)
-    return stated
+def _read_settings(paths: Sequence[Path], firmware: str) -> tuple[dict[str, float], list[Finding]]:
+    """Return what files state of the probe, X, Y beside the nozzle and Z [mm], by the first that
+    has it; and which files contradict an earlier one in that or in the geometry.
+    """
+    stated, noted = dict[str, float](), list[Finding]()
+    pattern = re.compile(rf"\b(M66[56]|{OFFSETS[firmware]})\b(.*)")
+    for path in paths:
+        own: dict[str, float] = {}
+        for line in read_text(path, "G-code file").upper().splitlines():
+            if match := pattern.search(line.partition(";")[0]):
+                words = re.findall(rf"([LRHXYZ])\s*{NUMBER}", match[2])
+                own |= {f"{match[1]} {letter}": float(number) for letter, number in words}
+        if changed := [word for word in own if own[word] != stated.get(word, own[word])]:
+            noted.append(report_finding("files.settings-differ", file=path.name, words=changed))
+        stated = own | stated
+    return {word[-1]: v for word, v in stated.items() if OFFSETS[firmware] in word}, noted
 
 
 def check_heights(
