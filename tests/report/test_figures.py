@@ -231,7 +231,7 @@ def test_accuracy_map_shows_every_pose_once_in_slices(name, request) -> None:
     assert sum(len(points.get_offsets()) for points in first) == bounded.sum()
     values = np.concatenate([points.get_array() for points in first])
     assert_allclose(np.sort(values), np.sort(1e3 * accuracy.uncertainty.position[bounded]))
-    assert accuracy.uncertainty.frame in figure.get_suptitle()
+    assert accuracy.uncertainty.frame in " ".join(figure.get_suptitle().split())
     check(figure)
 
 

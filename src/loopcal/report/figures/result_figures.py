@@ -180,7 +180,7 @@ def draw_accuracy_map(accuracy: AccuracyMap) -> Figure:
         if name == "position"
         or np.nanmax(accuracy.uncertainty.orientation, initial=0.0) > NEGLIGIBLE
     ]
-    width, height = 1.8 + 3.5 * len(slices), 1.5 + 3.1 * len(quantities)
+    width, height = 1.4 + 2.3 * len(slices), 1.2 + 2.2 * len(quantities)
     figure, grid = start_panels(width, height, len(quantities), len(slices))
     for panels, (name, unit) in zip(grid, quantities, strict=True):
         label = f"{name} uncertainty (rms) [{unit.symbol}]"
@@ -415,7 +415,7 @@ def draw_validation(validation: Validation) -> Figure:
     quantities, decisions = validation.quantities, validation.conformity
     has_kinds = validation.has_several_kinds or not quantities
     n, lines = len(quantities) + has_kinds, len(decisions)
-    heights = {"height_ratios": [2.7] * n + [1.1] * lines}
+    heights = {"height_ratios": [2.0] * n + [0.8] * lines}
     size = (9.5, 1.4 + sum(heights["height_ratios"]))
     figure, panels = start_panels(*size, n + lines, 1, gridspec_kw=heights)
     limits = {"position": validation.limit_position, "orientation": validation.limit_angle}

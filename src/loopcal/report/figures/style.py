@@ -9,6 +9,7 @@ markers, lines or labels differ, too.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from textwrap import fill
 from typing import TYPE_CHECKING, Any
 
 from loopcal.plain_text import escape
@@ -88,8 +89,9 @@ def label_axes(axes: Axes, x: str, y: str, title: str = "", grid: bool = True) -
 
 
 def finish_figure(figure: Figure, title: str) -> Figure:
-    """Write the title of a figure, and show all names as they are written; return it."""
-    figure.suptitle(title, fontsize=TITLE)
+    """Write the title of a figure in lines that fit, show all names as written, and return it."""
+    width = int(figure.get_size_inches()[0] * CHARACTERS * SMALL / TITLE)
+    figure.suptitle("\n".join(fill(line, width) for line in title.splitlines()), fontsize=TITLE)
     return show_names(figure)
 
 
