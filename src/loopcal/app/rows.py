@@ -11,7 +11,7 @@ from typing import Any
 
 from loopcal.io.core.csv_table import Cells, format_header, format_row, read_template
 from loopcal.io.core.text_file import read_text, write_text
-from loopcal.results.tables import choose_unit, format_in
+from loopcal.results.tables import to_quantity
 from loopcal.units import DISPLAY_UNITS
 
 Residuals = dict[str, tuple[float, str]]
@@ -28,8 +28,7 @@ def read_residuals(run: Path) -> tuple[Residuals, Sequence[str]]:
     for of in residuals_from_arrays(arrays):
         for label, raw, white in zip(of.poses, of.raw, abs(of.whitened), strict=True):
             i = int(white.argmax())
-            unit = choose_unit(DISPLAY_UNITS[of.dimensions[i]], [raw[i]])
-            text = f"{of.components[i]} {format_in(unit, raw[i], 3)} {unit.symbol}"
+            text = f"{of.components[i]} {to_quantity(raw[i], DISPLAY_UNITS[of.dimensions[i]])}"
             found[label] = max(found.get(label, (0.0, "")), (float(white[i]), text))
     held_out = (result.get("split") or {"held_out": ()})["held_out"]
     return {label: of for label, of in found.items() if label not in excluded}, held_out

@@ -116,7 +116,7 @@ class CheckUp(DrawnResult):
         for name, stated in self.units.items():
             unit = choose_unit(stated, (check.errors.get(name) for check in self.checks))
             heading = Column(f"{name} error, rms", unit.symbol)
-            columns.append((heading, lambda c, q=name, u=unit: _format_error(c, q, u)))
+            columns.append((heading, lambda c, q=name, u=unit: format_in(u, c.errors.get(q), 3)))
         table = build_table("Checks since the calibration", self.checks, *columns)
         return [*map(str, self.findings), "", table]
 
@@ -133,11 +133,6 @@ class CheckUp(DrawnResult):
     def __str__(self) -> str:
         """Return the findings, one on each line."""
         return "\n".join(f"{f.severity.value}: {f}" for f in self.findings)
-
-
-def _format_error(check: Check, quantity: str, unit: Unit) -> str:
-    """Return an error of a check, empty for what it did not measure."""
-    return format_in(unit, check.errors[quantity], 3) if quantity in check.errors else ""
 
 
 class CheckRows(NamedTuple):

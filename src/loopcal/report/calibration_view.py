@@ -44,6 +44,7 @@ from loopcal.results.tables import (
     format_uncertainty,
     format_with_uncertainty,
     make_table,
+    to_quantity,
     word_column,
 )
 from loopcal.units import UNITS, Dimension
@@ -57,7 +58,6 @@ if TYPE_CHECKING:
     from loopcal.diagnose.identifiable_parameters import Identifiability, Observability
     from loopcal.estimate.prior_inflation import PriorConflict
     from loopcal.mechanism.model import Mechanism
-    from loopcal.typing import FloatArray
 
 
 MOST_POINTS, MOST_LINES, MOST_MOVED = 200, 25, 10
@@ -89,12 +89,12 @@ def build_height_map(heights: HeightErrors) -> Table | str:
     errors = np.stack([heights.before, heights.after], axis=1) / unit.factor_to_si
     largest = float(np.abs(errors).max())
     decimals = count_decimals(largest, 3) if largest > 0.0 else 0
-    places = np.round(heights.points / unit.factor_to_si, 1) + 0.0  # 0.0 in place of -0.0
+    places = heights.points / unit.factor_to_si
     rows = [
         (
             pose,
-            *(f"{x:.1f}" for x in place),
-            *(f"{round(x, decimals) + 0.0:.{decimals}f}" for x in of_pose),
+            *(f"{x:z.1f}" for x in place),  # z: 0.0 in place of -0.0
+            *(f"{x:z.{decimals}f}" for x in of_pose),
             "held out" if is_held_out else "in the fit",
         )
         for pose, place, of_pose, is_held_out in zip(
@@ -151,16 +151,23 @@ def view_calibration(
     if errors is not None and report.reading_errors is not None:
         blocks.append(say("errors.reading-noise"))
     blocks += view_heights(report.height_errors, verbose)
-    selected = report.findings if verbose else report.top_findings
-    blocks += ["", *format_list([(f.severity.value, add_advice(f, hint(f))) for f in selected])]
-    if more := len(report.findings) - len(selected):
-        blocks.append(f"  ({name_count(more, 'more finding')} in the full report)")
+    more = [f for f in report.findings if str(f) not in blocks]  # than what the page says already
+    selected = more if verbose else [f for f in more if f in report.top_findings]
+    step, advice = str(report.next_step), hint(report.next_step) or ""
+    lines = []
+    for f in selected:  # without what the next step says, too
+        text, of_text = str(f), hint(f) or ""
+        text = text.removesuffix(f" {f.action}") if f.action in step else text
+        lines.append((f.severity.value, add_advice(text, None if of_text in advice else of_text)))
+    blocks += ["", *format_list(lines)]
+    if count := len(more) - len(selected):
+        blocks.append(f"  ({name_count(count, 'more finding')} in the full report)")
     if fit.converged and not verbose and fit.regularization is not None:
         blocks.append(f"  {fit.regularization.finding}")
     if report.comparison is not None:
         blocks += ["", str(report.comparison.outcome)]
-    blocks += ["", f"Recommendation: {report.recommendation}", f"Next: {report.next_step}"]
-    if advice := hint(report.next_step):
+    blocks += ["", f"Recommendation: {report.recommendation}", f"Next: {step}"]
+    if advice:
         blocks.append(f"Hint: {advice}")
     if fit.converged:
         shown, caption = stated["parameters"], "Parameters"
@@ -349,11 +356,7 @@ def build_budget_table(budget: Mapping[str, Any], robot: Mechanism) -> Table:
     def list_cells(
         words: str, evaluation: str, freedom: str, *errors: Mapping[str, float | None]
     ) -> list[str]:
-        numbers = [
-            ABSENT if (value := of.get(kind)) is None else format_in(unit, value, 3)
-            for of in errors
-            for kind, unit in shown.items()
-        ]
+        numbers = (format_in(unit, of.get(k), 3) for of in errors for k, unit in shown.items())
         return [words, evaluation, freedom, *numbers]
 
     rows = []
@@ -367,11 +370,8 @@ def build_budget_table(budget: Mapping[str, Any], robot: Mechanism) -> Table:
         fixed = _name_source(line), line["evaluation"], _format_degrees(line["degrees"] or math.inf)
         rows.append(list_cells(*fixed, errors, left))
     rows.append(list_cells("all sources", "", "", total, {}))
-    columns = [
-        Column(f"{before}{kind}", unit.symbol)
-        for before in ("", "halved: ")
-        for kind, unit in shown.items()
-    ]
+    titles = ((before + k, unit) for before in ("", "halved: ") for k, unit in shown.items())
+    columns = [Column(title, unit.symbol) for title, unit in titles]
     over = "poses of the workspace" if budget["over"] == "workspace" else "measured poses"
     caption = say("budget.meaning", poses=budget["poses"], over=over)
     return make_table(caption, ("source", "type", Column("degrees of freedom"), *columns), rows)
@@ -449,44 +449,33 @@ def view_compensation(result: Compensation) -> list[Block]:
     """Return the table of targets with their errors before and after, the convergence of shifted
     commands, and the frame.
     """
-    from loopcal.apply.compensation import ROUNDING
-
-    robot, units, uncertainty = result.robot, result.robot.shown_units, result.uncertainty
-    length, angle = units[Dimension.LENGTH], units[Dimension.ANGLE]
-    values: list[tuple[Column, FloatArray]] = []
-
-    def without_rounding(errors: FloatArray, size: float) -> FloatArray:
-        """Return errors, zero where they are rounding of a robot of this size."""
-        return np.where(errors < ROUNDING * size, 0.0, errors)
-
-    for part, unit, size in ((slice(3, 6), length, robot.size), (slice(0, 3), angle, 1.0)):
-        for name, errors in (("before", result.before), ("after", result.remaining)):
-            shown = without_rounding(np.linalg.norm(errors[:, part], axis=1), size)
-            values.append((Column(name, unit.symbol), shown / unit.factor_to_si))
-    if uncertainty is not None:
-        position, orientation = uncertainty.expanded_position, uncertainty.expanded_orientation
-        values.append((Column("U", length.symbol), position / length.factor_to_si))
-        values.append((Column("U", angle.symbol), orientation / angle.factor_to_si))
-    rows = [
-        (label, reach.value, *(format_number(float(numbers[i]), 3) for _, numbers in values))
-        for i, (label, reach) in enumerate(zip(result.labels, result.reach, strict=True))
+    robot, uncertainty = result.robot, result.uncertainty
+    length, angle = robot.get_unit(Dimension.LENGTH), robot.get_unit(Dimension.ANGLE)
+    values = [
+        (title, np.linalg.norm(result.drop_rounding(of_title)[:, part], axis=1), unit)
+        for unit, part in ((length, slice(3, 6)), (angle, slice(0, 3)))
+        for title, of_title in (("before", result.before), ("after", result.remaining))
     ]
-    caption = f"{robot.name}: {len(rows)} targets, {result.mode}"
-    columns = ("target", "status", *(column for column, _ in values))
-    blocks: list[Block] = [make_table(caption, columns, rows)]
+    if uncertainty is not None:
+        values.append(("U", uncertainty.expanded_position, length))
+        values.append(("U", uncertainty.expanded_orientation, angle))
+    columns: list[str | Column] = ["target", "status"]
+    cells: list[Sequence[str]] = [result.labels, [reach.value for reach in result.reach]]
+    for title, numbers, unit in values:
+        shown = choose_unit(unit, numbers.tolist())
+        columns.append(Column(title, shown.symbol))
+        cells.append([format_in(shown, number, 3) for number in numbers])
+    caption = f"{robot.name}: {len(result.labels)} targets, {result.mode}"
+    blocks: list[Block] = [make_table(caption, columns, zip(*cells, strict=True))]
     if result.residual_map is not None:
         blocks.append(str(result.residual_map))
     usable = result.usable
     if result.commands is not None and usable.any():
-        positions = without_rounding(result.residual_position[:, usable].max(axis=1), robot.size)
-        turns = without_rounding(result.residual_orientation[:, usable].max(axis=1), 1.0)
-        for step in range(1, len(positions)):
-            position = format_in(length, positions[step], 3)
-            turn = format_in(angle, turns[step], 3)
-            blocks.append(
-                f"After step {step}: at most {position} {length} and {turn} {angle} from the best "
-                "reachable poses."
-            )
+        distances = np.stack([result.residual_orientation, result.residual_position], axis=2)
+        largest = distances[1:, usable].max(axis=1).repeat(3, axis=1)
+        for step, (turn, *_, shift) in enumerate(result.drop_rounding(largest), 1):
+            most = f"{to_quantity(shift, length)} and {to_quantity(turn, angle)}"
+            blocks.append(f"After step {step}: at most {most} from the best reachable poses.")
     if uncertainty is not None:
         is_of_all = uncertainty.reference.data["frame"] in ("fitted", "base")
         others = "" if is_of_all else " Errors before and after are in the base frame."

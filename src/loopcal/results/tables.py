@@ -237,9 +237,10 @@ def format_number(value: float, digits: int = 6) -> str:
     return f"{0.0 if abs(value) < ROUNDING else value:.{digits}g}"
 
 
-def format_in(unit: Unit, value: float, digits: int = 6) -> str:
-    """Return a number in SI as one in a unit, without its symbol."""
-    return write_small(format_number(float(value) / unit.factor_to_si, digits))
+def format_in(unit: Unit, value: float | None, digits: int = 6) -> str:
+    """Return a number in SI as one in a unit, without its symbol; a dash for None."""
+    number = math.nan if value is None else float(value) / unit.factor_to_si
+    return write_small(format_number(number, digits))
 
 
 def to_quantity(number: float, unit: Unit) -> Quantity:
@@ -278,7 +279,7 @@ def format_with_uncertainty(value: float, uncertainty: float, digits: int = 9) -
         return format_number(value, digits)
     if abs(value) < INSIGNIFICANT * uncertainty:
         value = 0.0
-    return f"{value:.{count_decimals(uncertainty)}f}"
+    return f"{value:z.{count_decimals(uncertainty)}f}"  # z: 0.00 in place of -0.00
 
 
 def format_exact_beside(value: float, uncertainty: float) -> str:

@@ -85,10 +85,8 @@ REFUSED = {
     ),
     r"T_platform_tool has shape \(3, 3\)": lambda: Pose(T_platform_tool=np.eye(3)),
     "in the kind 'pose'. Allowed: frame, tool, bias, drift": lambda: Pose(unknown=("offset",)),
-    "the component 'w' does not exist. Use x, y, z; declare an orientation": (
-        lambda: Component(("w",))
-    ),
-    "declare an orientation to measure angles": lambda: Component(("phi", "theta")),
+    "the component 'w' does not exist. Use x, y, z; for angles": (lambda: Component(("w",))),
+    "for angles, declare orientation: tilt-torsion": lambda: Component(("phi", "theta")),
     "Use phi, theta, psi, x, y, z": lambda: Component(("a",), "tilt-torsion"),
     "the components are z, z. Name .* each once": lambda: Component(("z", "z")),
     "the components are empty. Name at least one": lambda: Component(()),

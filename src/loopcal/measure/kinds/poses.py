@@ -355,7 +355,7 @@ class Component(ToolKind):
             )
         for name in self.components:
             if name not in self._coordinates:
-                hint = "; declare an orientation to measure angles" if form is None else ""
+                hint = "; for angles, declare orientation: tilt-torsion" if form is None else ""
                 raise DataError(
                     f"the component {name!r} does not exist. Use {', '.join(self._coordinates)}"
                     f"{hint}"
