@@ -7,7 +7,6 @@ its changes before you commit them.
 
 import re
 import sys
-from collections.abc import Iterable
 from pathlib import Path
 
 from loopcal.findings import Severity, catalog
@@ -39,10 +38,9 @@ Notes, warnings and refusals are findings. In JSON a finding has `code`, `severi
 `text`. Programs read code and data, because the text may change. In Python, results hold
 `findings`, `str(finding)` is the text, and an error has the `code` of its finding.
 
-Most messages say what happened and what to do, so this page only lists their codes by severity
-([all texts](../tests/findings/wording.txt)). The tables have the others: how the message begins,
-then its condition and what to do. Words in *italics* stand for data, and texts in quotation marks
-are examples.
+Most messages say what happened and what to do ([all codes](../tests/findings/wording.txt)). This
+page has the others: how the message begins, then its condition and what to do. Words in *italics*
+stand for data, and texts in quotation marks are examples.
 """
 
 
@@ -64,15 +62,6 @@ def describe_circumstances(entry: Entry) -> str:
     return f"{entry.when} {action}".strip()
 
 
-def list_codes(entries: Iterable[Entry]) -> str:
-    """Return the codes of entries by severity, the least severe first."""
-    lines = []
-    for severity in SEVERITIES:
-        codes = [f"`{e.code}`" for e in entries if e.severity is severity]
-        lines += [f"- {severity.value}: {', '.join(codes)}\n"] * bool(codes)
-    return "".join(lines)
-
-
 def write_page() -> str:
     """Return docs/findings.md."""
     severities = [(f"`{severity.value}`", words) for severity, words in SEVERITIES.items()]
@@ -84,9 +73,9 @@ def write_page() -> str:
             for e, circumstances in entries
             if circumstances
         ]
-        sections.append(f"## {catalog.read_document(file)['title']}\n")
-        sections += [format_table(("code (severity)", "text"), rows)] * bool(rows)
-        sections.append(list_codes([e for e, circumstances in entries if not circumstances]))
+        if rows:
+            title = catalog.read_document(file)["title"]
+            sections += [f"## {title}\n", format_table(("code (severity)", "text"), rows)]
     return "\n".join(sections)
 
 

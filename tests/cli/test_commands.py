@@ -108,7 +108,8 @@ def test_noise_that_is_assumed_beside_a_stated_one_is_on_screen_and_in_json(
     loopcal, words, quantity, sigma
 ) -> None:
     printed = loopcal(f"{words} --json")
-    text = f"Each measured {quantity} has no standard deviation in the file. Assumed: {sigma}."
+    text = f"Each measured {quantity} has no standard deviation in the file. Assumed: {sigma}. "
+    text += "Enter both standard deviations."
     assert printed.err.count(text) == 1
     (finding,) = printed.json["input_findings"]
     assert (finding["code"], finding["text"]) == ("data.sigma-assumed", text)

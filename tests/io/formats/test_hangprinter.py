@@ -159,7 +159,7 @@ def test_keys_that_are_not_read_are_reported(tmp_path) -> None:
     assert "with 45 rows of motor angles" in notes
     for words in ("stiffness", "weight", "the unknown key 'colour'"):
         assert words in notes
-    assert "Noise of a line: 1 mm (assumed)" in notes
+    assert "Noise of a line: 1 mm (assumed: enter yours)" in notes
 
 
 @pytest.mark.parametrize(
@@ -252,7 +252,7 @@ def test_taped_lengths_are_nominal_values_with_the_tolerance_of_the_tape(tmp_pat
     assert "assumed" not in str(finding)
     robot, imported = read(tmp_path, tape(3))  # no sigma is stated
     np.testing.assert_allclose(robot.parameters.tolerance[LENGTHS], 0.01, rtol=1e-12)
-    assert any("standard deviation of 10 mm (assumed)" in str(f) for f in imported.findings)
+    assert any("of 10 mm (assumed: enter yours)" in str(f) for f in imported.findings)
 
 
 @pytest.mark.parametrize("empty", [None, 0])

@@ -85,7 +85,7 @@ def best_or_near(data: Data) -> str:
     if data["chosen"] == data["best"]:
         return "best"
     return fill_template(
-        "within one standard error of {best} ({best_parameters:count parameter})", **data
+        "within one standard error of the set {best} ({best_parameters:count parameter})", **data
     )
 
 
