@@ -26,9 +26,11 @@ from tools.markdown import fill_blocks, format_table
 ROOT = Path(__file__).resolve().parent.parent
 BLOCK = (
     r"evidence: (?P<name>[\w-]+)\.(?P<table>[\w-]+)(?:, (?P<column>[^=>]+) = (?P<value>[^>]+?))?"
-    r"(?:, columns to (?P<last>[^>]+))?"
+    r"(?:, columns to (?P<last>[^>]+?))?(?:, (?P<number>rows|range of|sum of)(?: (?P<of>[^>]+))?)?"
 )
-"""A table of an evidence file, or its rows with a value in a column, or its columns to one."""
+"""A table of an evidence file, or its rows with a value in a column, or its columns to one. In a
+sentence: the number of these rows "of" all rows, or the range or the sum of a column.
+"""
 
 
 class EvidenceError(Exception):
@@ -171,6 +173,31 @@ def _render_cell(value: Any, spec: str) -> str:
     return value if isinstance(value, str) else format(value, spec)
 
 
+def select_part(table: dict[str, Any], match: re.Match[str]) -> dict[str, Any]:
+    """Return the rows of a table with the value that a block names, and its columns to a last
+    one.
+    """
+    if match["column"]:
+        at = table["columns"].index(match["column"])
+        spec = table.get("formats", {at: ""})[at]
+        rows = [r for r in table["rows"] if _render_cell(r[at], spec) == match["value"]]
+        table = {**table, "rows": rows}
+    if match["last"]:
+        end = table["columns"].index(match["last"]) + 1
+        kept = {key: table[key][:end] for key in ("columns", "formats") if key in table}
+        table = {**kept, "rows": [row[:end] for row in table["rows"]]}
+    return table
+
+
+def render_number(table: dict[str, Any], match: re.Match[str]) -> str:
+    """Return the range or the sum of a column, without missing values."""
+    at = table["columns"].index(match["of"])
+    spec = table.get("formats", {at: ""})[at]
+    values = [row[at] for row in table["rows"] if row[at] is not None]
+    ends = [sum(values)] if match["number"] == "sum of" else [min(values), max(values)]
+    return " to ".join(dict.fromkeys(_render_cell(value, spec) for value in ends))
+
+
 def fill_tables(text: str, folder: Path) -> str:
     """Return a page with each of its evidence blocks made anew from the JSON files in `folder`.
 
@@ -189,16 +216,10 @@ def fill_tables(text: str, folder: Path) -> str:
                 f"{path} has no table {match['table']!r}; there are {', '.join(tables) or 'none'}"
             )
         table = tables[match["table"]]
-        if match["column"]:
-            at = table["columns"].index(match["column"])
-            spec = table.get("formats", {at: ""})[at]
-            rows = [r for r in table["rows"] if _render_cell(r[at], spec) == match["value"]]
-            table = {**table, "rows": rows}
-        if match["last"]:
-            end = table["columns"].index(match["last"]) + 1
-            kept = {key: table[key][:end] for key in ("columns", "formats") if key in table}
-            table = {**kept, "rows": [row[:end] for row in table["rows"]]}
-        return render_table(table)
+        part = select_part(table, match)
+        if match["number"] == "rows":
+            return f"{len(part['rows'])} of {len(table['rows'])}"
+        return render_number(part, match) if match["number"] else render_table(part)
 
     return fill_blocks(text, BLOCK, write)
 

@@ -26,4 +26,4 @@ def fill_blocks(text: str, begin: str, write: Callable[[re.Match[str]], str]) ->
 
 
 def _compile(begin: str) -> re.Pattern[str]:
-    return re.compile(f"(?P<begin><!-- {begin} -->\\n).*?<!-- end -->", re.DOTALL)
+    return re.compile(f"(?P<begin><!-- {begin} -->\\n?).*?<!-- end -->", re.DOTALL)

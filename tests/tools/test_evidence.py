@@ -47,6 +47,23 @@ def test_block_with_a_value_shows_the_rows_that_have_it(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    ("block", "number"),
+    [
+        ("cases.all, met = no, rows", "2 of 3"),
+        ("cases.all, range of share [%]", "1.0 to 3.0"),
+        ("cases.all, met = yes, range of share [%]", "3.0"),
+        ("cases.all, met = no, sum of fits", "50"),
+    ],
+)
+def test_block_in_a_sentence_is_a_number(block: str, number: str, tmp_path: Path) -> None:
+    rows = [["no", 20, 1.04], ["no", 30, None], ["yes", 40, 2.96]]
+    table = {"columns": ["met", "fits", "share [%]"], "formats": ["", "d", ".1f"], "rows": rows}
+    evidence.write_json(tmp_path / "cases.json", {"tables": {"all": table}})
+    page = "It is <!-- evidence: {} -->{}<!-- end --> now."
+    assert evidence.fill_tables(page.format(block, "?"), tmp_path) == page.format(block, number)
+
+
+@pytest.mark.parametrize(
     ("block", "sentence"),
     [
         (
