@@ -120,7 +120,7 @@ def format_keys(keys: Keys) -> str:
     rows = merge_rows((f"`{k.name}`", k.holds, k.meaning) for k in keys)
     named = [(f"{names}: {holds}", meaning) for names, holds, meaning in rows]
     if any(key.meaning for key in keys):
-        return format_table(("key: what it holds (default)", "meaning"), named)
+        return format_table(("key: value (default)", "meaning"), named)
     return "".join(f"- {key}\n" for key, _ in named)
 
 
@@ -164,9 +164,7 @@ def format_families() -> str:
         format_record(record, shown=shown)
     for name, family in FAMILIES.items():
         records = list_nested_records(family)
-        sections.append(
-            f"### `family: {name}`\n\n{summarize(family)}\n\n{format_record(family, shared, shown)}"
-        )
+        sections.append(f"### `family: {name}`\n\n{format_record(family, shared, shown)}")
         shown[f"family: {name}"] = shown.pop(file_reference.name_record(family))
         own = [record for record in records if record not in (*common, *SPREADS)]
         sections += [_format_nested(record, shown) for record in own]

@@ -186,12 +186,10 @@ class MethodLevel(Limited):
         0.01, "*.length": 1}`, see `Ridge.resolve`. keep : directions of truncated-svd. Without
         them cross-validation chooses both.
     loss, noise : as in `FitOptions`.
-    rows : for comparisons. "raw" gives all rows and parameters the weight one in millimeters and
-        radians, takes full steps and filters the step, as published studies do. Least-squares then
-        has no rank detection, and ridge and truncated-svd need `lam` and `keep`. "products" takes
-        products of points on planes and lines with their covariance, "products-printed" with the
-        weight one, "products-distance" as distances from the plane, "products-single" with their
-        own variances.
+    rows : for comparisons. "raw" rows have the weight one in millimeters and radians, full steps
+        and no rank detection: ridge and truncated-svd need `lam` and `keep`. "products" are
+        products of points on planes and lines with their covariance. "-printed" have the weight
+        one, "-distance" are distances from the plane, "-single" have own variances.
     epsilon : limit at which raw and per-leg fits end: of the largest component of a step [mm, rad]
         (raw fits, 1e-6 by default), or of what `stop` names. steps : of these fits, at most, or
         without epsilon exactly (3 by default for per-leg).

@@ -169,9 +169,8 @@ class ActuatorReadings(Kind):
 class Closure(Kind):
     """Actuator readings alone: the closed loops of a robot with redundant actuators.
 
-    No column is measured, so that a row has no residual of its own, no noise and no setup. The
-    robot must have more actuators than degrees of freedom. The `sigma` of its readings is the
-    noise.
+    Rows have no measured column, no noise and no setup. The robot must have more actuators than
+    degrees of freedom. The `sigma` of its readings is the noise.
     """
 
     name: ClassVar[str] = CLOSURE
