@@ -448,10 +448,8 @@ def examine_row(before: Companion, measured: Measurements, pose: int) -> Verdict
             return conclude("untestable", setup=tuple(names[i] for i in np.flatnonzero(is_open)))
         return conclude("fits", earlier=len(doubted))
     agreeing = [i for i in same if compare_visits(rows, i, n - 1, fit.scale) >= LEVEL]
-    if not doubted and not agreeing:
-        return conclude("repeat")
     if not agreeing:
-        return conclude("differ", visits=len(same) + 1)
+        return conclude("differ" if doubted else "repeat", visits=len(same) + 1)
     used[same] = False
     used[[*agreeing, n - 1]] = True
     apart = [i for i in same if before.is_used[i] and i not in agreeing]
@@ -459,9 +457,8 @@ def examine_row(before: Companion, measured: Measurements, pose: int) -> Verdict
         used[apart] = True  # it was right then
         return conclude_drift(apart[0], [*agreeing, n - 1])
     suspects = find_suspects(fit, fitted, [*agreeing, n - 1])
-    if len(suspects) == 1:
-        used[suspects] = False
     if suspects:
+        used[suspects] = len(suspects) > 1
         return conclude("earlier-wrong", suspects=tuple(task.labels[poses[i]] for i in suspects))
     check = compare_conventions(task.robot, measured.take(used))
     others = () if check.finding is None else (check.finding,)

@@ -108,7 +108,7 @@ def read(path: Path, options: ImportOptions) -> Imported:
         home = sum(math.hypot(x, y) for x, y, _ in base.tolist()) / 6
         findings = (report_finding("files.home-assumed", height=f"{home:g} {unit}"),)
     else:
-        home = options.home_height / unit.factor_to_si
+        home = round_digits(options.home_height / unit.factor_to_si)
     content: dict[str, Any] = {
         "legs": "ups" if lead else "rod",
         "base": base.tolist(),

@@ -59,6 +59,10 @@ def geometry(data_folder) -> dict:
 def test_pins_are_the_parameters_that_the_controller_stores(tmp_path, geometry) -> None:
     sets = list_parameter_sets(read(tmp_path, format_hal(geometry), home_height=0.020))
     assert len(sets["controller"]) == 36
+    written = hal_file.read(
+        tmp_path / "hexapod.hal", ImportOptions("hexapod", length_unit="mm", home_height=0.35)
+    )
+    assert "\nhome: {z: 350.0}\n" in written.text  # not 349.99999999999994
     assert not any(name.endswith("length") for name in sets["controller"])
 
 
