@@ -62,7 +62,7 @@ def test_pins_are_the_parameters_that_the_controller_stores(tmp_path, geometry) 
     written = hal_file.read(
         tmp_path / "hexapod.hal", ImportOptions("hexapod", length_unit="mm", home_height=0.35)
     )
-    assert "\nhome: {z: 350.0}\n" in written.text  # not 349.99999999999994
+    assert "\nhome: {z: 350.0}\n" in written.robot_text  # not 349.99999999999994
     assert not any(name.endswith("length") for name in sets["controller"])
 
 
