@@ -91,7 +91,7 @@ def leave_out_drawing(patch: pytest.MonkeyPatch) -> None:
 
     patch.setattr("matplotlib.figure.Figure.savefig", save)
     patch.setattr("matplotlib.figure.Figure.draw_without_rendering", lambda _: None)
-    empty = b'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 400 300"></svg>'
+    empty = b'<svg xmlns="http://www.w3.org/2000/svg" width="400pt" viewBox="0 0 400 300"></svg>'
     patch.setattr("loopcal.report.pictures._render_svg", lambda _: empty)
 
 

@@ -147,8 +147,8 @@ def draw_residual_rows(
     for s in series:  # those of one kind and dimension share an axis
         groups.setdefault((s.kind, s.dimension), []).append(s)
     rows = -(-len(quantities) // COLUMNS)
-    figure = start_figure(11.0, 0.8 + 2.2 * len(groups) + 2.6 + 2.3 * rows)
-    heights = [*[2.2] * len(groups), 2.6, *[2.3] * rows]
+    heights = [*[1.6] * len(groups), 2.4, *[1.7] * rows]
+    figure = start_figure(11.0, 0.8 + sum(heights))
     grid = figure.add_gridspec(len(heights), 2 * COLUMNS, height_ratios=heights)
     for i, group in enumerate(groups.values()):
         raw = np.concatenate([s.raw for s in group])
