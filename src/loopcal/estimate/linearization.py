@@ -302,17 +302,17 @@ def evaluate_rows(
     """
     measured, white = rows.take_trials(trials)
     T = poses.T
-    if _count_rows_of_poses(rows, T.shape[1]) != 1:
+    if rows.rows_of_each != 1 or len(rows.poses) != T.shape[1]:
         T = T[:, rows.poses]
     T = np.broadcast_to(T, (len(trials), *T.shape[1:]))
-    used = nuisance is not None and rows.nuisance.shape[1]
-    nuisance_values = nuisance[:, rows.nuisance] if nuisance is not None and used else None
-    if rows.factor is not None and nuisance_values is not None:
-        nuisance_values = nuisance_values * rows.factor
+    values = None
+    if nuisance is not None and rows.nuisance.shape[1]:
+        values = nuisance[:, rows.nuisance]
+        values = values if rows.factor is None else values * rows.factor
     joints = rows.kind.stack_joints(poses.joints, rows.poses)
     if joints is not None:
         joints = np.broadcast_to(joints, (len(trials), *joints.shape[1:]))
-    evaluated = rows.kind.evaluate(T, measured, nuisance_values, joints)
+    evaluated = rows.kind.evaluate(T, measured, values, joints)
     if rows.factor is not None and evaluated.nuisance is not None:
         evaluated = evaluated._replace(nuisance=evaluated.nuisance * rows.factor[:, None, :])
     return evaluated, white
@@ -375,17 +375,13 @@ def _write_parameter_columns(
     """Write whitened derivatives of a kind by the p scaled parameters to rows (a, r, m, p + 1)."""
     D, out = poses.by_parameters, machine[..., :-1]
     if rows.kind.poses_per_row > 1:
-        linked = (
-            evaluated.jacobian[:, :, i] @ D[:, rows.poses[:, i]]
-            for i in range(rows.kind.poses_per_row)
-        )
-        np.matmul(white, sum(linked, start=np.zeros(1)), out=out)
+        np.matmul(white, np.matmul(evaluated.jacobian, D[:, rows.poses]).sum(axis=2), out=out)
         return
     by_twist, product = rows.whiten_columns(white, evaluated.jacobian), out
-    if count := _count_rows_of_poses(rows, D.shape[1]):
-        n, height = D.shape[1], count * machine.shape[2]
-        by_twist = by_twist.reshape(len(by_twist), n, height, 6)
-        product = machine.reshape(len(machine), n, height, machine.shape[-1])[..., :-1]
+    n, count = D.shape[1], rows.rows_of_each
+    if count and count * n == len(rows.poses):
+        by_twist = by_twist.reshape(len(by_twist), n, -1, 6)
+        product = machine.reshape(len(machine), n, -1, machine.shape[-1])[..., :-1]
     else:
         D = D[:, rows.poses]
     # one order of the products for any number of trials: each trial equals its own fit bit for bit
@@ -404,29 +400,15 @@ def _coordinate_columns(
     Y: FloatArray,
 ) -> FloatArray:
     """Return whitened derivatives (a, r, links, m, k) of a kind by the coordinates of its poses."""
-    if rows.kind.poses_per_row > 1:
-        linked = [
-            np.matmul(
-                white, coordinate_derivative(evaluated.jacobian[:, :, i], Y[:, rows.poses[:, i]])
-            )
-            for i in range(rows.kind.poses_per_row)
-        ]
-        return np.stack(linked, axis=2)
     columns = coordinate_derivative(evaluated.jacobian, Y[:, rows.poses])
+    if rows.kind.poses_per_row > 1:
+        return np.matmul(white[:, :, None], columns)
     if evaluated.joints is not None and rows.kind.sensed_joints:
         turns = [
             poses.joints_by_coordinates[name][:, rows.poses] for name in rows.kind.sensed_joints
         ]
         columns = columns + np.matmul(evaluated.joints, np.stack(turns, axis=2))
     return np.matmul(white, columns)[:, :, None]
-
-
-def _count_rows_of_poses(rows: ObservationRows, count: int) -> int:
-    """Return the number of rows of each pose, where all poses have as many, one behind the other in
-    the order of the poses; else 0.
-    """
-    each = len(rows.poses) // max(count, 1)
-    return each * np.array_equal(rows.poses, np.arange(count).repeat(each))
 
 
 # Poses of a batch of trials: their states, and what solving for them gives.

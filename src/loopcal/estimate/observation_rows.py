@@ -63,6 +63,15 @@ class ObservationRows:
         """(t | 1, r, m) components that are not absent."""
         return np.asarray(np.einsum("trii->tri", self.whitener) != 0.0)
 
+    @cached_property
+    def rows_of_each(self) -> int:
+        """Number of rows of each pose from the first to the last one of these rows, where all have
+        as many, one behind the other in the order of the poses; else 0.
+        """
+        each = int((self.poses == 0).sum())
+        ordered = np.arange(len(self.poses) // max(each, 1)).repeat(each)
+        return each * np.array_equal(self.poses, ordered)
+
     def take_rows(self, rows: IntArray, place: IntArray) -> ObservationRows:
         """Return some rows with poses renumbered: pose i becomes place[i]."""
         if len(rows) == len(self.poses):

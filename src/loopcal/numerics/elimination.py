@@ -662,6 +662,13 @@ def without_rounding(values: FloatArray, size: FloatArray) -> FloatArray:
     return np.where(np.abs(values) <= limit, 0.0, values)
 
 
+def has_rounding(values: FloatArray, size: float) -> bool:
+    """Return whether any of derivatives may be rounding of terms that are at most this large."""
+    limit = ROUNDING * size
+    larger = np.count_nonzero(values > limit) + np.count_nonzero(values < -limit)
+    return bool(larger < np.count_nonzero(values != 0.0))
+
+
 # Elimination of leading columns of stacked rows by orthogonal projection.
 
 # Rows that the projection leaves shorter than this share of the largest are rounding.

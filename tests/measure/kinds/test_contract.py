@@ -295,6 +295,17 @@ def test_rows_do_not_depend_on_their_batch(kind):
         assert_allclose(alone.jacobian[0, 0], together.jacobian[i, j], atol=1e-12 * rounding)
 
 
+@pytest.mark.parametrize("spread", [0.4, 1e-14])
+@pytest.mark.parametrize("kind", WITH_UNKNOWNS)
+def test_rounding_is_sought_row_by_row_only_where_there_may_be_some(kind, spread, monkeypatch):
+    kind = attach_frame_and_tool(kind)
+    T = platform_poses(kind, 2, 5, spread=spread)
+    measured, _ = measure_with_errors(kind, T, 1e-3)
+    at_once = evaluate_kind(kind, T, measured).nuisance
+    monkeypatch.setattr("loopcal.measure.kinds.kind.has_rounding", lambda *_: True)
+    np.testing.assert_array_equal(at_once, evaluate_kind(kind, T, measured).nuisance)
+
+
 @every_kind
 def test_kind_without_a_tool_is_refused_and_keeps_the_first_tool(kind):
     if kind.has_tool:

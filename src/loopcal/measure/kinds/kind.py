@@ -33,7 +33,7 @@ from loopcal.errors import DataError
 from loopcal.measure.array_checks import set_fields
 from loopcal.measure.kinds.setup_parameters import SetupItem, encode_frame
 from loopcal.mechanism.limb_rows import name_entries
-from loopcal.numerics.elimination import without_rounding
+from loopcal.numerics.elimination import has_rounding, without_rounding
 from loopcal.numerics.statistics import find_distinct
 from loopcal.parameters import Parameter
 from loopcal.plain_text import represent
@@ -589,14 +589,16 @@ class Kind(ABC):
             # beside the derivative by the twist is zero. Radians count as moves of the largest
             # distance from the base, whatever the size of a machine.
             reach = np.abs(T[..., :3, 3]).max(initial=0.0)
-            reach = np.where(reach > 0.0, reach, 1.0)
-            square = result.jacobian**2
-            by_move = np.sqrt(
-                square[..., :3].sum(axis=-1) / reach**2 + square[..., 3:].sum(axis=-1)
-            )
-            by_move = by_move.sum(axis=-2) if self.poses_per_row > 1 else by_move
-            size = by_move[..., None] * np.where(np.array(self._is_length), 1.0, reach)
-            result = result._replace(nuisance=without_rounding(result.nuisance, size))
+            reach = float(reach) if reach > 0.0 else 1.0
+            largest = self.poses_per_row * np.sqrt(6.0) * (reach + 1.0 / reach)
+            if has_rounding(result.nuisance, largest * np.abs(result.jacobian).max(initial=0.0)):
+                square = result.jacobian**2
+                by_move = np.sqrt(
+                    square[..., :3].sum(axis=-1) / reach**2 + square[..., 3:].sum(axis=-1)
+                )
+                by_move = by_move.sum(axis=-2) if self.poses_per_row > 1 else by_move
+                size = by_move[..., None] * np.where(np.array(self._is_length), 1.0, reach)
+                result = result._replace(nuisance=without_rounding(result.nuisance, size))
         if self.of:  # rows of a stage depend on its platform, those of the base on no motion
             by_entries = (
                 None if self.is_of_base else result.jacobian @ geometry.differentiate_by_entries(T)
