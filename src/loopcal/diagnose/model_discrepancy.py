@@ -453,17 +453,18 @@ def project_slow_errors(linear: FitLinearization, errors: SmoothErrors) -> SlowE
     prior = np.zeros((k, k + m + 1))
     prior[:, :k] = np.diag(np.sqrt(penalty))
     prior[:, -1] = np.sqrt(penalty) * d.coordinates(linear.linearization.deviation)[0][used]
-    factor = extended.factor[0]
+    factor, p = extended.factor[0], len(used)
     factor = factor[factor.any(axis=1)]  # there may be fewer rows than coefficients
-    p = len(used)
-    columns = np.concatenate([factor[:, :p] @ to_z, factor[:, p:]], axis=1)
-    R = np.asarray(np.linalg.qr(np.concatenate([columns, prior[penalty > 0.0]]), mode="r"))
+    # only the first rows of a triangle have columns of the parameters
+    first = np.concatenate([factor[:p, :p] @ to_z, factor[:p, p:]], axis=1)
+    top = np.asarray(np.linalg.qr(np.concatenate([first, prior[penalty > 0.0]]), mode="r"))
+    rest = np.linalg.qr(np.concatenate([factor[p:, p:], top[k:, k:]]), mode="r")
     degrees = int(extended.equations[0] + (penalty > 0.0).sum()) - k
     if degrees < FEWEST_DEGREES:
         return None
-    slope = linear.fit.tolerance[:, None] * (to_z @ np.linalg.solve(R[:k, :k], R[:k, k : k + m]))
-    last = k + min(m, degrees)  # further rows are rounding
-    triangle, residuals = R[k:last, k : k + m], R[k:last, k + m]
+    slope = linear.fit.tolerance[:, None] * (to_z @ np.linalg.solve(top[:k, :k], top[:k, k:-1]))
+    rest = np.asarray(rest[: min(m, degrees)])  # further rows are rounding
+    triangle, residuals = rest[:, :m], rest[:, m]
     by_direction = factor[:, p : p + m].reshape(len(factor), -1, len(errors.centers))
     sizes = np.linalg.norm(by_direction, axis=(0, 2))
     if not np.linalg.norm(triangle) > UNSEEN * np.linalg.norm(sizes):
@@ -489,16 +490,14 @@ def _find_axes(rows: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the axes u (k, r) of the variances that rows (k, m) times independent errors have, and
     these variances (r,). Weak ones need no accuracy: they weigh little.
     """
-    filled = rows.any(axis=1)  # a triangle has zeros below
-    part, basis = rows[filled], None
-    if part.shape[0] > part.shape[1]:
-        basis, part = np.linalg.qr(part)
-    variances, inner = np.linalg.eigh(part @ part.T)
+    part = rows[filled := rows.any(axis=1)]  # a triangle has zeros below
+    is_tall = part.shape[0] > part.shape[1]
+    variances, inner = np.linalg.eigh(part.T @ part if is_tall else part @ part.T)
     kept = variances > NEGLIGIBLE * variances[-1]
-    inner = inner[:, kept]
+    variances, inner = variances[kept], inner[:, kept]
     axes = np.zeros((len(rows), inner.shape[1]))
-    axes[filled] = inner if basis is None else basis @ inner
-    return axes, variances[kept]
+    axes[filled] = part @ (inner / np.sqrt(variances)) if is_tall else inner
+    return axes, variances
 
 
 # Singular values of the whiteners of repeats below this share of the largest belong to components

@@ -234,8 +234,9 @@ def check_instruments(observations: Sequence[Observations]) -> list[Finding]:
             findings.append(report_finding("data.instrument-calibrated-later", **stated))
     # each file has its own kinds, and those with equal settings measure the same
     days = {id(o.kind): o.instrument.measured if o.instrument else "" for o in observations}
-    kinds = Counter({id(o.kind): repr(o.kind) for o in observations}.values())
-    joined = (days[id(o.kind)] for o in observations if kinds[repr(o.kind)] > 1)
+    kinds = {id(o.kind): repr(o.kind) for o in observations if len(days) > 1}
+    count = Counter(kinds.values())
+    joined = (days[number] for number, kind in kinds.items() if count[kind] > 1)
     return [*findings, *report_days([*joined, *filter(None, days.values())])]
 
 
