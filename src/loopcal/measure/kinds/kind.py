@@ -589,7 +589,7 @@ class Kind(ABC):
             # beside the derivative by the twist is zero. Radians count as moves of the largest
             # distance from the base, whatever the size of a machine.
             reach = np.abs(T[..., :3, 3]).max(initial=0.0)
-            reach = float(reach) if reach > 0.0 else 1.0
+            reach = np.where(reach > 0.0, reach, 1.0)
             largest = self.poses_per_row * np.sqrt(6.0) * (reach + 1.0 / reach)
             if has_rounding(result.nuisance, largest * np.abs(result.jacobian).max(initial=0.0)):
                 square = result.jacobian**2
