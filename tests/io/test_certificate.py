@@ -234,9 +234,8 @@ def test_certificate_follows_the_schema_and_states_the_run(tmp_path, run) -> Non
 @pytest.mark.evidence  # the schema of PTB must not be copied into this repository
 @pytest.mark.skipif(
     not os.environ.get("LOOPCAL_DCC_SCHEMA"),
-    reason="LOOPCAL_DCC_SCHEMA names a folder with dcc.xsd 3.3.0 and SI_Format.xsd 2.2, which "
-    "ptb.de alone has: packages (dcclib, pydcc) load them from there, and public repositories "
-    "go up to dcc.xsd 3.2.1, by which only the stated version is wrong",
+    reason="LOOPCAL_DCC_SCHEMA names a folder with dcc.xsd 3.3.0 and SI_Format.xsd 2.2 of PTB: "
+    "lib/dcc/schema/resources of the public repository lutaml/dcc has both (passed 2026-11-30)",
 )
 def test_certificate_is_valid_by_the_schema_of_ptb(tmp_path, run) -> None:
     xmlschema = pytest.importorskip("xmlschema")
