@@ -230,9 +230,9 @@ def find_unit(symbol: str, dimension: Dimension | None = None) -> Unit:
     )
 
 
-# A number of a file. Python also reads `1_000` and digits of other alphabets.
+# A number of a file. Python also reads `1_000`, digits of other alphabets and longer exponents.
 NUMBER = re.compile(
-    r"[+-]?(?:(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?|inf(?:inity)?|nan)", re.ASCII | re.IGNORECASE
+    r"[+-]?(?:(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d{1,5})?|inf(?:inity)?|nan)", re.ASCII | re.IGNORECASE
 )
 
 

@@ -106,8 +106,11 @@ def test_robot_files_and_exports_have_at_most_seventeen_digits(
         assert count_digits(longest) <= 17, longest
 
 
-@pytest.mark.parametrize("text", ["1_0", "\uff11\uff12", "1\u0663", "\u0967.5", "1e\u0663"])
-def test_files_state_numbers_in_ascii_digits(tmp_path, text) -> None:
+HUGE = f"1e{10**18 - 1}", f"1e-{10**20}"  # beyond `Decimal`: its product, or itself
+
+
+@pytest.mark.parametrize("text", ["1_0", "\uff11\uff12", "1\u0663", "\u0967.5", "1e\u0663", *HUGE])
+def test_files_state_numbers_in_ascii_digits_with_an_exponent_of_a_few(tmp_path, text) -> None:
     """Python reads more texts as numbers; one definition holds for all files."""
     float(text)
     assert parse_number(text) is None

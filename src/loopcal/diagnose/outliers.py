@@ -22,6 +22,7 @@ geometry so far that right poses seem wrong. Blocks are then compared at a robus
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, ClassVar, NamedTuple
@@ -132,9 +133,11 @@ def compute_block_influence(
     G, identity = half @ half.swapaxes(-1, -2), np.eye(half.shape[1])
     variance = identity + (1.0 - 2.0 * weight)[:, None, None] * G
     leverage, count = np.einsum("bii->b", G), present.sum(axis=1)
-    if (leverage < UNPREDICTABLE).all() and _are_positive(variance - TESTABLE * identity):
-        solved = np.linalg.solve(variance, residual[..., None])[..., 0]
-        return Influence(weight * leverage, count, (residual * solved).sum(axis=1), count)
+    with suppress(np.linalg.LinAlgError):  # raised where a direction is beyond these limits
+        np.linalg.cholesky(variance - TESTABLE * identity)
+        if (leverage < UNPREDICTABLE).all():
+            solved = np.linalg.solve(variance, residual[..., None])[..., 0]
+            return Influence(weight * leverage, count, (residual * solved).sum(axis=1), count)
     v, vectors = np.linalg.eigh(variance)
     # absent rows are zero: eigenvectors of value one and residual zero, subtracted below
     tested = (v > TESTABLE) & (v < UNPREDICTABLE)
@@ -143,15 +146,6 @@ def compute_block_influence(
     return Influence(
         weight * leverage, count, distance, tested.sum(axis=1) - (~present).sum(axis=1)
     )
-
-
-def _are_positive(matrices: FloatArray) -> bool:
-    """Return whether all matrices (b, m, m) are positive definite."""
-    try:
-        np.linalg.cholesky(matrices)
-    except np.linalg.LinAlgError:
-        return False
-    return True
 
 
 def iterate_blocks(

@@ -408,7 +408,7 @@ class PosePredictions:
     def residuals(self, observations: Sequence[Observations]) -> list[FloatArray]:
         """Return the prediction errors (r, m) of every kind."""
         return [
-            o.compute_residuals(self.T, *self._inputs_of(i, o))[0]
+            o.kind.compute_residuals(self.T[:, o.rows], o.measured[None], *self._inputs_of(i, o))[0]
             for i, o in enumerate(observations)
         ]
 
@@ -435,11 +435,8 @@ class PosePredictions:
         """
         alone, sizes = np.linalg.norm(root.values, axis=1), []
         for i, o in enumerate(observations):
-            used, factor, inputs = (
-                self.setup.indices[i],
-                self.setup.factor(i),
-                self._inputs_of(i, o),
-            )
+            used, factor = self.setup.indices[i], self.setup.factor(i)
+            inputs = self._inputs_of(i, o)
             sizes.append(size := np.zeros(len(o)))
             if not used.size:
                 continue

@@ -28,7 +28,7 @@ from loopcal.measure.readings import (
     resolve_reading_sigma,
 )
 from loopcal.mechanism.model import Mechanism
-from loopcal.numerics.statistics import compute_known_median, compute_median
+from loopcal.numerics.statistics import compute_known_median, compute_median, find_distinct
 from loopcal.results.tables import to_quantity
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import DISPLAY_UNITS, find_unit
@@ -338,26 +338,21 @@ def _find_static_targets(measurements: Measurements) -> Iterator[_StaticTarget]:
             _, of, count = np.unique(own, axis=0, return_inverse=True, return_counts=True)
             alike = is_measured.copy()
             alike[is_measured] = of.ravel() == np.argmax(count) if len(count) else False
-        names, number = np.unique(rows.session, return_inverse=True)
-        by_session = np.argsort(number, kind="stable")
-        for target, columns in targets.items():
-            values = rows.measured[:, columns]
-            is_complete = alike & ~np.any(np.isnan(values), axis=1)
-            count = np.bincount(number[is_complete], minlength=len(names))
-            sessions = np.flatnonzero(count)
-            if not len(sessions):
-                continue
-            first, ordered = (
-                (np.cumsum(count) - count)[sessions],
-                by_session[is_complete[by_session]],
-            )
-            ends = (f.reduceat(values[ordered], first) for f in (np.maximum, np.minimum))
-            range_ = np.subtract(*ends)
-            limit = STATIC_SIGMAS * noise[columns] if target in whole else 1e-15
-            is_static = (count[sessions] >= 3) & np.all(range_ < limit, axis=1)
-            for i in np.flatnonzero(is_static):
-                present = is_complete & (number == sessions[i])
-                yield _StaticTarget(rows, target, present, columns, range_[i], noise[columns])
+        limits = {
+            target: STATIC_SIGMAS * noise[columns] if target in whole else 1e-15
+            for target, columns in targets.items()
+        }
+        for session in find_distinct(rows.session):
+            own = alike & (rows.session == session)
+            ends = (np.inf, np.fmin), (-np.inf, np.fmax)
+            low, high = (f.reduce(rows.measured[own], axis=0, initial=end) for end, f in ends)
+            for target, columns in targets.items():
+                if not np.all(high[columns] - low[columns] < limits[target]):
+                    continue
+                present = own & ~np.any(np.isnan(rows.measured[:, columns]), axis=1)
+                if np.count_nonzero(present) >= 3:
+                    range_ = np.ptp(rows.measured[present][:, columns], axis=0)
+                    yield _StaticTarget(rows, target, present, columns, range_, noise[columns])
 
 
 def _group_equal_kinds(observations: tuple[Observations, ...]) -> list[list[Observations]]:

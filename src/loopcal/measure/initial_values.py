@@ -188,7 +188,8 @@ def find_equal_values(
     cost = np.zeros((len(others), len(used)))
     for i, rows in enumerate(observations):
         if len(rows) and nuisance.indices[i].shape[1]:
-            residual = rows.compute_residuals(T[None], nuisance.select(i, others))
+            own = T[None, rows.rows], rows.measured[None], nuisance.select(i, others)
+            residual = rows.kind.compute_residuals(*own)
             square = ((rows.whitener @ residual[..., None]) ** 2).sum(axis=(2, 3))
             of = cluster[nuisance.indices[i]].max(axis=1)
             np.add.at(cost.T, of[of >= 0], square.T[of >= 0])

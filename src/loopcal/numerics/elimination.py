@@ -240,12 +240,10 @@ class NodeFactors:
     tree: EliminationTree
     trials: int
     parameters: int
-    most: float
+    most: float = 4e6
 
-    def __init__(
-        self, tree: EliminationTree, trials: int, parameters: int, most: float = 4e6
-    ) -> None:
-        self.tree, self.trials, self.parameters, self.most = tree, trials, parameters, most
+    def __init__(self, tree: EliminationTree, trials: int, parameters: int) -> None:
+        self.tree, self.trials, self.parameters = tree, trials, parameters
         self._factors: list[FloatArray] = [
             np.zeros((trials, len(s), 0, s.width + parameters + 1)) for s in tree.structures
         ]

@@ -415,7 +415,8 @@ def guess_frames(
     sizes = [np.zeros((h, 0))]
     for o, places in zip(data.observations, nuisance.indices, strict=True):
         if len(o) and not o.kind.sensed_joints:
-            residual = o.compute_residuals(T, start[:, places])
+            at = T[:, o.rows], o.measured[None], start[:, places]
+            residual = o.kind.compute_residuals(*at)
             whitened = np.matmul(o.whitener, residual[..., None])[..., 0]
             sizes.append(np.linalg.norm(whitened, axis=-1))
     size = np.concatenate(sizes, axis=1)

@@ -18,7 +18,7 @@ from bisect import bisect_right
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from decimal import Decimal, InvalidOperation
+from decimal import Decimal
 from functools import cache
 from itertools import accumulate, chain, takewhile
 from pathlib import Path
@@ -46,7 +46,7 @@ def parse_decimals(cells: Sequence[str], factor: float) -> FloatArray:
     def parse(cell: str) -> float:
         try:
             product = float(Decimal(cell) * exact)
-        except (ValueError, InvalidOperation):
+        except (ValueError, ArithmeticError):  # such as of a number of 1e18 digits
             return math.nan
         return product if is_plain or parse_number(cell) is not None else math.nan
 
