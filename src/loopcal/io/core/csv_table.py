@@ -46,7 +46,7 @@ def parse_decimals(cells: Sequence[str], factor: float) -> FloatArray:
     def parse(cell: str) -> float:
         try:
             product = float(Decimal(cell) * exact)
-        except (ValueError, ArithmeticError):  # such as of a number of 1e18 digits
+        except (ValueError, ArithmeticError):  # such as by an exponent of 18 digits
             return math.nan
         return product if is_plain or parse_number(cell) is not None else math.nan
 
