@@ -36,7 +36,7 @@ from loopcal.mechanism.model import Mechanism, SlotMap, Stage
 from loopcal.mechanism.over_constraint import report_over_constraint
 from loopcal.mechanism.platform_coordinates import differentiate_coordinates, read_coordinates
 from loopcal.mechanism.sensitivity import differentiate_pose
-from loopcal.mechanism.states import driven_values, is_closed, make_start
+from loopcal.mechanism.states import is_closed, make_start
 from loopcal.mechanism.transmission import LOAD, list_constants, name_terms, nominal_terms
 from loopcal.numerics.decomposition import find_null_space
 from loopcal.parameters import ParameterTable
@@ -176,9 +176,8 @@ def _close_at_home(
         record,
     )
     if robot.is_serial and not robot.controlled:
-        loops = kinematics.Loops.place(robot)
-        joints = driven_values(robot.program, robot.home_state)
-        return replace(robot, home_state=loops.solve(joints, robot.home_state))
+        loops, home = kinematics.Loops.place(robot), robot.home_state
+        return replace(robot, home_state=loops.solve(loops.read(home), home))
     robot = replace(robot, home_state=_find_home(robot))
     mobility = _count_freedoms(assembly, program)
     if has_spare := _has_spare_drives(assembly, mobility):

@@ -291,8 +291,7 @@ class _Rows:
             slope[~ok], residual[~ok] = np.eye(*slope.shape[1:]), 0.0
         is_square = slope.shape[1] == slope.shape[2] and self.poses is None
         sign = np.sign(np.linalg.det(slope)) if is_square else np.ones(len(ok))
-        is_regular = is_square and sign.all()
-        inverse = np.linalg.inv(slope) if is_regular else np.linalg.pinv(slope, rcond=DEPENDENT)
+        inverse = np.linalg.inv(slope) if is_square and sign.all() else _invert_slopes(slope)
         moved = -np.matmul(inverse, residual[..., None])
         step = np.zeros_like(now.u)
         step[:, self.moving] = moved[..., 0]
@@ -394,6 +393,16 @@ class _Rows:
             for stage, e in zip(self.robot.blocks, self.e, strict=True)
         ]
         return chains.join_stage_states(self.robot, states)
+
+
+def _invert_slopes(slope: FloatArray) -> FloatArray:
+    """Return pseudo-inverses (R, u, c) of slopes (R, c, u), without dependent combinations."""
+    if slope.shape[1] <= slope.shape[2]:
+        orthogonal, triangle = np.linalg.qr(slope.swapaxes(1, 2))
+        pivots = np.abs(np.einsum("...ii->...i", triangle))  # up to 2^c singular values
+        if (pivots.min(axis=1) > 2.0 ** slope.shape[1] * DEPENDENT * pivots.max(axis=1)).all():
+            return np.matmul(orthogonal, np.linalg.inv(triangle).swapaxes(1, 2))
+    return np.asarray(np.linalg.pinv(slope, rcond=DEPENDENT), np.float64)
 
 
 def _select_drives(stage: Stage, u: FloatArray) -> FloatArray:

@@ -66,9 +66,8 @@ def find_wrong_rows(robot: Mechanism, state: State, sign: NDArray[np.int8]) -> B
     """
     closed = state.status == Status.CONVERGED.value
     beyond = (state.closure_sign != sign) | (state.residual > WIDE * robot.size)
-    failed = (
-        ~closed & (state.status != Status.NOT_FINITE.value) & (state.status != engine.NEAR_GOAL)
-    )
+    failed = ~closed & (state.status != Status.NOT_FINITE.value)
+    failed &= state.status != engine.NEAR_GOAL
     return failed | closed & beyond
 
 
@@ -179,8 +178,7 @@ def follow_path(
         zero = np.zeros(len(alive), int)
         begun = first.select((len(trial), 1), alive, zero)
         path = origin[alive], target[alive]
-        leave = count == PATH_STEPS[-1]
-        current = _take_steps(loops.select(alive), path, begun, count, leave)
+        current = _take_steps(loops.select(alive), path, begun, count, count == PATH_STEPS[-1])
         result = replace_rows(result, alive, zero, current)
         alive = alive[find_wrong_rows(robot, current, begun.closure_sign)[:, 0]]
         if not len(alive):

@@ -149,8 +149,7 @@ def _follow_path(robot: Mechanism, first: State, step: Step) -> tuple[State, Boo
         safe[safe] = contracts(robot, select_poses(present, safe), select_poses(following, safe))
         share[rows] = np.where(safe, wanted, share[rows])
         length[rows] *= np.where(safe, GROWTH, GROWTH**-2)
-        done, kept = rows[safe], select_poses(following, safe)
-        current = put_poses(current, done, kept)
+        current = put_poses(current, rows[safe], select_poses(following, safe))
     return current, share >= 1.0
 
 
@@ -227,9 +226,8 @@ def reach_coordinates(
     is_plain = not (robot.is_serial or moves_by_drives(robot) or robot.program.idle_groups)
     if not (is_plain and robot.program.is_square and target.shape[1] and determine_platform(robot)):
         return close_at_coordinates(robot, values, target, start), None
-    e, _ = robot.slots(values)
     goal = state_target(target, robot.controlled, robot.home)
-    reached = engine.reach(robot.program, e, goal, start or robot.home_state)
+    reached = engine.reach(robot.program, robot.present[0], goal, start or robot.home_state)
     return reached.state, reached.arrives[0]
 
 

@@ -61,7 +61,9 @@ def differentiate(
                 readings = _pick(inputs.readings, trial, pose)
                 driving.append(entries.by_reading(columns, readings, group))
                 if program.sigma:
-                    sigma.append(_deviations(program.sigma, group, columns))
+                    deviation = np.array(program.sigma)[group.actuator.max(axis=0)]
+                    of_rows = np.abs(columns[:, :, len(group.slots)]) * deviation
+                    sigma.append(of_rows.reshape(len(of_rows), -1).T)
             weights = 1.0 / np.concatenate(sigma) if sigma else None
             steps = np.ascontiguousarray(_invert(program, A, weights)[:m].transpose(2, 0, 1))
             for out, of_groups in ((by_parameter, moving), (by_reading, driving)):
@@ -136,12 +138,6 @@ def _select_entries(group: Group, inputs: ParameterMap) -> _Entries:
     arrays = [np.concatenate(of_all, axis=-1) for of_all in zip(*entries, strict=True)]
     order = np.lexsort((arrays[2], arrays[0]))
     return _Entries(*(array[..., order] for array in arrays))
-
-
-def _deviations(sigma: Sequence[float], group: Group, columns: FloatArray) -> FloatArray:
-    """Return the standard deviation (r k, N) that a redundant actuator gives each row."""
-    drive = np.abs(columns[:, :, len(group.slots)]) * np.array(sigma)[group.actuator.max(axis=0)]
-    return drive.reshape(len(drive), -1).T
 
 
 def _invert(

@@ -458,7 +458,7 @@ def repair_rounded_loops(graph: JointGraph, rounding: tuple[float, float]) -> Re
     if np.abs(graph.linearize(q[None])[0]).max(initial=0.0) > limit:
         return unchanged
     repaired, turn = _align_axes(graph, q, limit)
-    if not _can_move(repaired, repaired.close(q[None])[0]):
+    if not np.isfinite(repaired.close(q[None])).all():  # with too many motors it cannot move either
         return unchanged
     placement = graph.place(q[None])
     gaps = [measure_gap(graph, placement, joint) for joint in graph.closing]
