@@ -129,3 +129,12 @@ def test_gap_that_digits_do_not_explain_is_refused_with_its_size(tmp_path, digit
     path.write_text(text[:start] + moved + text[start + len(number) :])
     with pytest.raises(LoopcalError, match=GAP):
         read(path)
+
+
+def test_rounded_loops_of_a_file_with_too_many_motors_are_not_called_open(tmp_path) -> None:
+    path = write(tmp_path, "table", 6)
+    closures = path.with_suffix(".yaml")
+    closures.write_text(closures.read_text().replace("name_mot: [", "name_mot: ['elbow0', "))
+    found = linkage_format.read(urdf.read_tree(path), ImportOptions("machine"), "a URDF")
+    assert "files.loops-rounded" in {finding.code for finding in found.findings}
+    assert "the mobility is 3, but there are 4 motors" in " ".join(map(str, found.findings))
