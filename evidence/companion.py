@@ -244,7 +244,7 @@ def collect() -> dict:
                 "columns": [
                     "robot",
                     "goal [um]",
-                    "noise over stated noise",
+                    "noise over given noise",
                     "rows with the companion (mean)",
                     "rows of the plan and its repeats (mean)",
                     "rows against the plan [%]",
