@@ -472,7 +472,7 @@ def test_held_out_rows_are_predicted_with_the_discrepancy():
     u = pose_uncertainty(fit, forward(fit.robot, other.readings), frame="base")
     noise = fit.residual_test.sigma_scale * SIGMA
     for group in blocks.groups:
-        variance = noise**2 * (group.rows**2).sum(axis=(1, 2))
+        variance = noise**2 * (group.rows[..., :-1] ** 2).sum(axis=(1, 2))
         assert np.allclose(np.sqrt(variance), u.position[group.blocks], rtol=0.02)
 
 
