@@ -286,15 +286,10 @@ def print_pdf(page: Path, output: Path) -> None:
                 "a browser and print it",
                 output,
             )
-        _check_pdf(printed)
-        write_bytes(output, printed.read_bytes())
-
-
-def _check_pdf(file: Path) -> None:
-    """Raise FileError where a file is not a complete PDF file."""
-    content = file.read_bytes()
-    if not content.startswith(b"%PDF-") or _END.search(content) is None:
-        raise FileError("this is not a complete PDF file", file)
+        content = printed.read_bytes()
+        if not content.startswith(b"%PDF-") or _END.search(content) is None:
+            raise FileError("this is not a complete PDF file", printed)
+        write_bytes(output, content)
 
 
 # Write the 3-D view of a robot or of a calibration as one HTML file, and open it.

@@ -17,12 +17,8 @@ import numpy as np
 from loopcal.errors import DataError, FileError, suggest_names
 from loopcal.findings import Finding, report_finding
 from loopcal.io.core.csv_table import Table as Sheet
+from loopcal.io.data import measurement_file
 from loopcal.io.data.kind_settings import KindRows
-from loopcal.io.data.measurement_file import (
-    has_empty_readings,
-    load_instrument_to_plan,
-    load_measurements,
-)
 from loopcal.io.exports.conversion import read_sheet
 from loopcal.io.exports.growing_export import GrowingExport, read_new_rows
 from loopcal.io.formats.gcode_program import format_move
@@ -81,13 +77,13 @@ def prepare_session(
     FileError : the sheet asks for readings, or has measured values. Raises as `prepare_task`.
     """
     table, entry = read_sheet(sheet, robot)
-    if has_empty_readings(sheet, robot):
+    if measurement_file.has_empty_readings(sheet, robot):
         raise FileError("this sheet asks for readings. Fill in the file itself", sheet)
     asked = {} if goal is None else dict(zip(("goal", "target"), goal, strict=True))
     task = companion.prepare_task(
-        load_measurements(sheet, robot),
+        measurement_file.load_measurements(sheet, robot),
         robot,
-        load_instrument_to_plan(sheet, robot),
+        measurement_file.load_instrument_to_plan(sheet, robot),
         restore_options({**find_asked(sheet), **asked}),
         pace,
         check_every,

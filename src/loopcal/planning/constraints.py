@@ -19,12 +19,8 @@ from loopcal.checks import NOT_NEGATIVE, POSITIVE, Limit, Limited
 from loopcal.errors import DataError
 from loopcal.measure.array_checks import check_array
 from loopcal.measure.measurements import Measurements
+from loopcal.mechanism import singularities
 from loopcal.mechanism.model import Mechanism
-from loopcal.mechanism.singularities import (
-    NEAR_SHARE,
-    compute_median_margins,
-    find_near_singularity,
-)
 from loopcal.mechanism.solutions import Solution
 from loopcal.mechanism.workspace import evaluate_limits
 from loopcal.typing import BoolArray, FloatArray
@@ -122,7 +118,7 @@ class Constraints(PlanSettings):
         "stroke_margin": Limit(lambda value: 0.0 <= value < np.inf, "finite, 0 m or more"),
         "stroke_margin_angle": Limit(lambda value: 0.0 <= value < np.inf, "finite, 0 rad or more"),
     }
-    min_margin: float = NEAR_SHARE
+    min_margin: float = singularities.NEAR_SHARE
     max_tilt: float | None = None
     sight: LineOfSight | None = None
     stroke_margin: float = 0.0
@@ -190,7 +186,7 @@ class ConstraintChecker:
         refuse(~solution.converged, "other-mode")
         share = required.min_margin
         least = share * self.medians[0], share * self.medians[1]
-        is_near = find_near_singularity(robot, solution.state, least, allowed, steps)
+        is_near = singularities.find_near_singularity(robot, solution.state, least, allowed, steps)
         refuse(is_near, "near-singularity", ("min_margin", share))
         if required.max_tilt is not None:
             T = solution.T
@@ -229,7 +225,7 @@ def build_checker(robot: Mechanism, constraints: Constraints | None) -> Constrai
                 margin=robot.to_quantity(margin, dimension),
                 stroke=robot.to_quantity(strokes[name], dimension),
             )
-    return ConstraintChecker(robot, required, compute_median_margins(robot))
+    return ConstraintChecker(robot, required, singularities.compute_median_margins(robot))
 
 
 def list_reasons(counts: Counter[Violation]) -> tuple[dict[str, Any], ...]:

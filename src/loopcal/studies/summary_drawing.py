@@ -28,13 +28,8 @@ from loopcal.report.figures.style import (
 from loopcal.report.pictures import render_figure
 from loopcal.report.words import say
 from loopcal.results.tables import choose_unit
-from loopcal.studies.specification import (
-    ScoreColumn,
-    Study,
-    check_question,
-    list_chains,
-    read_columns,
-)
+from loopcal.studies import specification
+from loopcal.studies.specification import ScoreColumn, Study
 from loopcal.studies.study_result import UNITS, CellSummary, Interval, StudySummary, find_columns
 from loopcal.units import Unit
 
@@ -104,10 +99,10 @@ def choose_layout(study: Study, factor: str | None = None) -> Layout:
         check_choice("factor", factor, factors, DataError)
 
     def count_ordered(name: str) -> int:
-        return max(len(c.levels) * bool(c.quantity) for c in list_chains(study, name))
+        return max(len(c.levels) * bool(c.quantity) for c in specification.list_chains(study, name))
 
     axis = factor or max(varied, key=count_ordered, default=factors[0])
-    chains = list_chains(study, axis)
+    chains = specification.list_chains(study, axis)
     first, label, words = chains[0], axis, dict[str, str]()
     is_numeric = bool(first.quantity) and len({(c.quantity, c.unit) for c in chains}) == 1
     is_numeric &= len(chains) == 1 or any(len(chain.levels) > 1 for chain in chains)
@@ -160,7 +155,7 @@ def draw_score(
     levels = dict.fromkeys(layout.find_level(cell, layout.color) for cell in summary.cells)
     colors = dict(zip(levels, COLORS, strict=False))  # the same in all panels
     asked = [question for question in study.questions.values() if question.score == score]
-    limits = dict.fromkeys(check_question(study, question) for question in asked)
+    limits = dict.fromkeys(specification.check_question(study, question) for question in asked)
     found = {kind: _list_values(summary.cells, score, kind) for kind in STYLES}
     kinds = [kind for kind in STYLES if found[kind]]
     ends = [interval.value for kind in kinds for _, interval in found[kind]]
@@ -295,6 +290,6 @@ def _list_titles(study: Study, summary: StudySummary, column: ScoreColumn, width
     if column.name.startswith(IN_FRAME):
         frame = study.scores.frame
         if frame == "both":
-            frame = "base" if column in read_columns()["base"] else "fitted"
+            frame = "base" if column in specification.read_columns()["base"] else "fitted"
         lines += textwrap.wrap(say(f"study.frame-{frame}"), width)
     return [*lines, f"n = {trials} trials of each cell that did not fail; bars are 95 % intervals"]

@@ -14,11 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from loopcal.engine.numpy_engine.householder import (
-    back_substitute,
-    count_reflections,
-    triangularize,
-)
+from loopcal.engine.numpy_engine import householder
 from loopcal.engine.program import BASE, Group, Program
 from loopcal.typing import FloatArray
 
@@ -53,8 +49,8 @@ def factor_nodes(
     for node in (*first, *[len(program.nodes)] * has_sums, last):
         m = program.widths[node]
         nodes, rows = _join(program, node, [f for f in left if node in f.nodes], sides, left[0])
-        count = count_reflections(len(rows), m)
-        rows = triangularize(rows, m)
+        count = householder.count_reflections(len(rows), m)
+        rows = householder.triangularize(rows, m)
         signs = np.sign(np.diagonal(rows[:m, :m]))
         sign = sign * (-1.0) ** count * np.multiply.reduce(signs, axis=-1)
         factored.append(Front(nodes, rows[:m]))
@@ -96,7 +92,7 @@ def solve_nodes(
             for y in known[other]:  # one after the other, whatever the number of rows
                 right = right - rows[:, first, None] * y
                 first += 1
-        known[node] = back_substitute(rows[:, :m], right)
+        known[node] = householder.back_substitute(rows[:, :m], right)
         yield node, known[node]
 
 

@@ -13,18 +13,9 @@ import numpy as np
 
 from loopcal import geometry
 from loopcal.measure.array_checks import check_direction, check_pose
+from loopcal.measure.kinds import kind
 from loopcal.measure.kinds import setup_parameters as setup
-from loopcal.measure.kinds.kind import (
-    Column,
-    Evaluation,
-    InvalidRows,
-    Kind,
-    checked,
-    is_incomplete,
-    list_not_unit,
-    list_rows,
-    make_angles,
-)
+from loopcal.measure.kinds.kind import Column, Evaluation, InvalidRows, Kind
 from loopcal.measure.kinds.position import convert_camera_angles, predict_camera_angles
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import Dimension
@@ -127,7 +118,7 @@ class AxisKind(DirectionKind):
     Others : see `DirectionKind`.
     """
 
-    T_base_frame: FloatArray = checked(check_pose, "T_base_frame", np.eye(4))
+    T_base_frame: FloatArray = kind.checked(check_pose, "T_base_frame", np.eye(4))
     frame: str = "frame"
 
 
@@ -153,7 +144,7 @@ class Direction(AxisKind):
         something else.
     """
 
-    axis: FloatArray = checked(check_direction, "the axis", UPWARD)
+    axis: FloatArray = kind.checked(check_direction, "the axis", UPWARD)
     axis_name: str = "axis"
 
     name: ClassVar[str] = "direction"
@@ -170,7 +161,7 @@ class Direction(AxisKind):
     @property
     def noise_columns(self) -> tuple[Column, ...]:
         """Two angles perpendicular to the direction."""
-        return make_angles("across_a", "across_b")
+        return kind.make_angles("across_a", "across_b")
 
     @property
     def stated(self) -> tuple[str, FloatArray, str, FloatArray]:
@@ -189,8 +180,8 @@ class Direction(AxisKind):
     def find_invalid_rows(self, measured: FloatArray) -> InvalidRows:
         """Return rows with an incomplete direction, or one whose length is not 1."""
         incomplete = "has an incomplete direction. Give i, j and k, or none of them"
-        invalid = list_rows(is_incomplete(measured), lambda _: incomplete)
-        return invalid + list_not_unit(measured, "direction")
+        invalid = kind.list_rows(kind.is_incomplete(measured), lambda _: incomplete)
+        return invalid + kind.list_not_unit(measured, "direction")
 
     def convert_to_directions(self, measured: FloatArray) -> tuple[FloatArray, ...]:
         """Return the columns, scaled to length one."""
@@ -244,12 +235,12 @@ class Inclination(DirectionKind):
         something else.
     """
 
-    up: FloatArray = checked(check_direction, "the vertical", UPWARD)
-    T_platform_sensor: FloatArray = checked(check_pose, "T_platform_sensor", np.eye(4))
+    up: FloatArray = kind.checked(check_direction, "the vertical", UPWARD)
+    T_platform_sensor: FloatArray = kind.checked(check_pose, "T_platform_sensor", np.eye(4))
     sensor: str = "inclinometer"
 
     name: ClassVar[str] = "inclination"
-    per_target: ClassVar[tuple[Column, ...]] = make_angles("tilt_x", "tilt_y")
+    per_target: ClassVar[tuple[Column, ...]] = kind.make_angles("tilt_x", "tilt_y")
     allowed_unknown: ClassVar[tuple[str, ...]] = ("mounting", "gravity")
     inward: ClassVar[bool] = True
 
@@ -289,7 +280,7 @@ class Inclination(DirectionKind):
     def find_invalid_rows(self, measured: FloatArray) -> InvalidRows:
         """Return rows whose two tilts are impossible together."""
         is_beyond_vertical = np.any(np.abs(measured) > np.pi / 2, axis=-1)
-        return list_rows(
+        return kind.list_rows(
             is_beyond_vertical | (np.sum(np.sin(measured) ** 2, axis=-1) > 1.0),
             lambda i: (
                 "has tilts of {:.6g} and {:.6g} deg, which are impossible together: elevations of "
@@ -322,11 +313,11 @@ class Autocollimation(AxisKind):
         something else.
     """
 
-    normal: FloatArray = checked(check_direction, "the normal of the mirror", UPWARD)
+    normal: FloatArray = kind.checked(check_direction, "the normal of the mirror", UPWARD)
     mirror: str = "mirror"
 
     name: ClassVar[str] = "autocollimation"
-    per_target: ClassVar[tuple[Column, ...]] = make_angles("angle_x", "angle_y")
+    per_target: ClassVar[tuple[Column, ...]] = kind.make_angles("angle_x", "angle_y")
     allowed_unknown: ClassVar[tuple[str, ...]] = ("frame", "mirror")
 
     @classmethod
@@ -352,7 +343,7 @@ class Autocollimation(AxisKind):
     def find_invalid_rows(self, measured: FloatArray) -> InvalidRows:
         """Return rows whose mirror faces away from the instrument."""
         away = np.abs(measured) >= np.pi / 2
-        return list_rows(
+        return kind.list_rows(
             np.asarray(np.any(away, axis=-1)),
             lambda i: (
                 f"has an angle of {np.rad2deg(measured[i][away[i]][0]):.6g} deg, at which the "

@@ -13,19 +13,9 @@ import numpy as np
 from loopcal import engine, geometry
 from loopcal.errors import DataError
 from loopcal.measure.array_checks import check_names, check_pose, set_fields
+from loopcal.measure.kinds import kind
 from loopcal.measure.kinds import setup_parameters as setup
-from loopcal.measure.kinds.kind import (
-    POSITION_COLUMNS,
-    Column,
-    Evaluation,
-    InvalidRows,
-    Kind,
-    MeasuredColumns,
-    checked,
-    is_incomplete,
-    list_not_unit,
-    list_rows,
-)
+from loopcal.measure.kinds.kind import Column, Evaluation, InvalidRows, Kind, MeasuredColumns
 from loopcal.measure.kinds.setup_parameters import POSITION_AXES
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import Dimension
@@ -49,8 +39,8 @@ class ToolKind(Kind):
     frame : name of the frame. Kinds that use the same name share its parameters.
     """
 
-    T_base_frame: FloatArray = checked(check_pose, "T_base_frame", np.eye(4))
-    T_platform_tool: FloatArray | None = checked(check_pose, "T_platform_tool")
+    T_base_frame: FloatArray = kind.checked(check_pose, "T_base_frame", np.eye(4))
+    T_platform_tool: FloatArray | None = kind.checked(check_pose, "T_platform_tool")
     unknown: tuple[str, ...] = ()
     frame: str = "frame"
 
@@ -182,13 +172,13 @@ class Pose(ToolKind):
     def columns(self) -> tuple[Column, ...]:
         """Orientation, then x y z."""
         orientation = tuple(Column(name, self.form.dimension) for name in self.form.columns)
-        return orientation + POSITION_COLUMNS
+        return orientation + kind.POSITION_COLUMNS
 
     @property
     def noise_columns(self) -> tuple[Column, ...]:
         """Three rotations or angles, then x y z."""
         rotations = tuple(Column(name, Dimension.ANGLE) for name in self.form.noise_columns)
-        return rotations + POSITION_COLUMNS
+        return rotations + kind.POSITION_COLUMNS
 
     def detect_present(self, measured: FloatArray) -> BoolArray:
         """Return which residuals exist: the orientation as a whole, x y z one by one."""
@@ -206,10 +196,10 @@ class Pose(ToolKind):
             "has an incomplete orientation. Give all of its columns or none, or use the kind "
             "'component'"
         )
-        invalid = list_rows(is_incomplete(orientation), lambda _: incomplete)
+        invalid = kind.list_rows(kind.is_incomplete(orientation), lambda _: incomplete)
         if self.orientation != "quaternion":
             return invalid
-        return invalid + list_not_unit(orientation, "quaternion", ", with the scalar first")
+        return invalid + kind.list_not_unit(orientation, "quaternion", ", with the scalar first")
 
     @property
     def placeholder(self) -> FloatArray:
@@ -400,7 +390,7 @@ class Component(ToolKind):
         name, middle = self.form.name, measured[..., self.components.index("b")]
         angles = np.stack([np.zeros_like(middle), middle, np.zeros_like(middle)], axis=-1)
         determinant = np.abs(np.linalg.det(self.form.rates(np.nan_to_num(angles, nan=0.5))))
-        return list_rows(
+        return kind.list_rows(
             determinant < SINGULAR_RATES,
             lambda i: (
                 f"has b = {np.rad2deg(middle[i]):.6g} deg, at which a and c of {name} are one "

@@ -18,8 +18,8 @@ from numpy.typing import ArrayLike
 from loopcal import geometry
 from loopcal.errors import MechanismError
 from loopcal.mechanism.assembly import AXES, Actuator, Assembly, Cone, Joint
+from loopcal.mechanism.families import placement
 from loopcal.mechanism.families.placement import (
-    EZ,
     AngleTolerance,
     ErrorModel,
     JointPlacement,
@@ -27,14 +27,6 @@ from loopcal.mechanism.families.placement import (
     LinkTolerances,
     PlacedLimb,
     Point,
-    offset_error,
-    place_limb,
-    place_limb_with_ball,
-    point_errors,
-    rod_length_error,
-    rotation_matrix,
-    standard_deviation,
-    translate,
 )
 from loopcal.mechanism.families.records import RobotRecord, check_spherical, values_per_leg
 from loopcal.typing import FloatArray
@@ -80,7 +72,7 @@ def build_leg(
         gap, f"{name} has length zero at home. Move its centers or the home pose"
     )
     pitch = turned = 0.0
-    lower = upper = geometry.find_perpendicular(s, EZ)
+    lower = upper = geometry.find_perpendicular(s, placement.EZ)
     if screw:
         zero = f"a joint axis of {name} is [0, 0, 0]. Give a direction"
         (lower, _), (upper, _) = (_normalize(axis, zero) for axis in screw[1:])
@@ -95,22 +87,24 @@ def build_leg(
         turned = float(np.arctan2(np.cross(low, high) @ s, low @ high))
     # the axes in the base frame, which is the carried frame while every joint is at zero
     steps = (
-        JointPlacement(Joint("universal1", "R"), translate(*base), lower),
+        JointPlacement(Joint("universal1", "R"), placement.translate(*base), lower),
         JointPlacement(Joint("universal2", "R"), np.eye(4), np.cross(s, low)),
         JointPlacement(Joint("slide", "P", motor, start=length + pitch * turned), np.eye(4), s),
     )
     if not screw:
         ball = home[:3, :3] if axes else None
-        return place_limb_with_ball(name, steps, np.zeros(3), translate(*top), ball)
+        return placement.place_limb_with_ball(
+            name, steps, np.zeros(3), placement.translate(*top), ball
+        )
     # at zero the spindle stands turned back by the angle that it has at home
-    back = rotation_matrix(geometry.exp_so3(-turned * s))
+    back = placement.rotation_matrix(geometry.exp_so3(-turned * s))
     thread = (
         JointPlacement(Joint("screw", "R", pitch=-pitch, start=turned), np.eye(4), s),
         JointPlacement(Joint("universal3", "R"), back, np.cross(s, high)),
         JointPlacement(Joint("universal4", "R"), np.eye(4), upper),
     )
-    end = rotation_matrix(home[:3, :3]), "rigid", translate(*top)
-    return place_limb(name, (*steps, *thread), *end)
+    end = placement.rotation_matrix(home[:3, :3]), "rigid", placement.translate(*top)
+    return placement.place_limb(name, (*steps, *thread), *end)
 
 
 def _normalize(vector: ArrayLike, refusal: str) -> tuple[FloatArray, float]:
@@ -228,9 +222,9 @@ class Gough(RobotRecord):
         """Return leg i in its form."""
         leg, motor, base, top = f"leg{i + 1}", f"q{i + 1}", self.base[i], self.platform[i]
         if self.legs == "rod":
-            ends = translate(*base), translate(*top)
+            ends = placement.translate(*base), placement.translate(*top)
             cones = self._cones(*ends)
-            return place_limb(leg, (), ends[0], "distance", ends[1], length, motor, cones)
+            return placement.place_limb(leg, (), ends[0], "distance", ends[1], length, motor, cones)
         axes, screw = self.spherical == "axes", self.screw
         of_leg = None
         if screw:
@@ -255,14 +249,14 @@ class Gough(RobotRecord):
         links have errors of their own, the length.
         """
         sd, name, errors = self.tolerances, f"{leg.name}.length", ErrorModel()
-        length_sd = standard_deviation(sd.length, "the leg lengths")
+        length_sd = placement.standard_deviation(sd.length, "the leg lengths")
         if self.error_model == "ideal":
-            base_sd = standard_deviation(sd.base, "the base centers")
-            platform_sd = standard_deviation(sd.platform, "the platform centers")
-            errors = point_errors(f"{leg.name}.base.", leg, leg.elements[0], base_sd)
-            errors += point_errors(f"{leg.name}.platform.", leg, "platform", platform_sd)
+            base_sd = placement.standard_deviation(sd.base, "the base centers")
+            platform_sd = placement.standard_deviation(sd.platform, "the platform centers")
+            errors = placement.point_errors(f"{leg.name}.base.", leg, leg.elements[0], base_sd)
+            errors += placement.point_errors(f"{leg.name}.platform.", leg, "platform", platform_sd)
         if self.legs == "rod":
-            return errors + rod_length_error(leg, name, length_sd)
-        return errors + offset_error(
+            return errors + placement.rod_length_error(leg, name, length_sd)
+        return errors + placement.offset_error(
             name, motor, Dimension.LENGTH, length, length_sd, positive=True
         )

@@ -20,26 +20,12 @@ import numpy as np
 from loopcal import geometry
 from loopcal.errors import MechanismError
 from loopcal.mechanism.assembly import AXES, Actuator, Assembly, Joint
+from loopcal.mechanism.families import placement
 from loopcal.mechanism.families.placement import (
-    EX,
-    EY,
-    EZ,
     ErrorModel,
     JointPlacement,
     LinkTolerances,
     PlacedLimb,
-    displacement_error,
-    join_errors,
-    map_displacement,
-    map_slide_tilt,
-    offset_error,
-    place_limb,
-    place_limb_with_ball,
-    point_errors,
-    rod_length_error,
-    rotate_about,
-    single_error,
-    translate,
 )
 from loopcal.mechanism.families.records import RobotRecord, check_spherical
 from loopcal.typing import FloatArray
@@ -75,21 +61,21 @@ def build_carriage_limb(
         length * np.cos(lean) if axis else np.sqrt(length**2 - gap[0] ** 2 - gap[1] ** 2)
     )
     slide = Joint("guide", "P", name.replace("chain", "q"), start=float(gap[2] - height))
-    steps: tuple[JointPlacement, ...] = (JointPlacement(slide, base, EZ),)
+    steps: tuple[JointPlacement, ...] = (JointPlacement(slide, base, placement.EZ),)
     rod, upright = np.array([gap[0], gap[1], height]), T[:3, :3]
     if axis:
-        turn = EY if axis == "y" else EX
+        turn = placement.EY if axis == "y" else placement.EX
         steps += (JointPlacement(Joint("joint", "R", start=lean), np.eye(4), turn),)
-        rod, upright = length * EZ, geometry.exp_so3(-lean * turn) @ upright
+        rod, upright = length * placement.EZ, geometry.exp_so3(-lean * turn) @ upright
     elif axes:
-        first = np.cross(rod, EY)
+        first = np.cross(rod, placement.EY)
         steps += (
             JointPlacement(Joint("universal1", "R"), np.eye(4), first),
             JointPlacement(Joint("universal2", "R"), np.eye(4), np.cross(rod, first)),
         )
     else:
-        return place_limb(name, steps, np.eye(4), "distance", platform, length)
-    return place_limb_with_ball(name, steps, rod, platform, upright if axes else None)
+        return placement.place_limb(name, steps, np.eye(4), "distance", platform, length)
+    return placement.place_limb_with_ball(name, steps, rod, platform, upright if axes else None)
 
 
 def carriage_errors(
@@ -108,24 +94,25 @@ def carriage_errors(
     foot, guide, joint : axes of b, thB and thC. The z coordinate of b has the same effect as q.
     """
     length, angle = map(spread.select, (Dimension.LENGTH, Dimension.ANGLE))
-    errors = [point_errors(f"a{number}", limb, "platform", length)]
-    errors.append(point_errors(f"b{number}", limb, "guide", length, foot))
+    errors = [placement.point_errors(f"a{number}", limb, "platform", length)]
+    errors.append(placement.point_errors(f"b{number}", limb, "guide", length, foot))
     (motor,), rod = limb.limb.drives, f"l{number}"
-    errors.append(offset_error(f"q{number}", motor, Dimension.LENGTH, 0.0, length))
+    errors.append(placement.offset_error(f"q{number}", motor, Dimension.LENGTH, 0.0, length))
     if limb.limb.ending == "distance":
-        errors.append(rod_length_error(limb, rod, length))
+        errors.append(placement.rod_length_error(limb, rod, length))
     else:
-        errors.append(displacement_error(rod, limb, "tip", "z", length, positive=True))
+        errors.append(placement.displacement_error(rod, limb, "tip", "z", length, positive=True))
     # a tilt of the guide does not rotate a joint on the carriage
-    tilt = map_slide_tilt if len(limb.limb.joints) > 1 else map_displacement
+    tilt = placement.map_slide_tilt if len(limb.limb.joints) > 1 else placement.map_displacement
     for axis in guide:
         name = f"thB{number}{axis}"
         maps = tilt(name, limb, "guide", f"r{axis}")
-        errors.append(single_error(name, Dimension.ANGLE, 0.0, angle, *maps))
+        errors.append(placement.single_error(name, Dimension.ANGLE, 0.0, angle, *maps))
     errors += (
-        displacement_error(f"thC{number}{axis}", limb, "joint", f"r{axis}", angle) for axis in joint
+        placement.displacement_error(f"thC{number}{axis}", limb, "joint", f"r{axis}", angle)
+        for axis in joint
     )
-    return join_errors(errors)
+    return placement.join_errors(errors)
 
 
 # RU-PUS-PRS solar trackers: a platform on a post, tilted about two axes by two carriages.
@@ -171,7 +158,7 @@ class CarriageRobot(RobotRecord):
         drives = [name for limb in limbs for name in limb.limb.drives]
         return self.assemble(
             limbs,
-            ErrorModel() if spread else join_errors(errors),
+            ErrorModel() if spread else placement.join_errors(errors),
             freedoms=AXES,
             controlled=controlled,
             own=(Actuator(name, Dimension.LENGTH, self.stroke) for name in drives),
@@ -195,29 +182,33 @@ class RuPusPrs(CarriageRobot):
         """Return three limbs under a free platform."""
         a, b, axes = self.platform_radius, self.base_radius, self.spherical == "axes"
         of_rods, spread = (self.rod, self.home.matrix), self.tolerances
-        second = translate(0.0, b), translate(0.0, a)
+        second = placement.translate(0.0, b), placement.translate(0.0, a)
         # revolute joint, link and universal joint; at home all frames are parallel
         steps = (
-            JointPlacement(Joint("pivot", "R"), np.eye(4), EY),
-            JointPlacement(Joint("universal1", "R"), translate(0.0, 0.0, self.post), EX),
-            JointPlacement(Joint("universal2", "R"), np.eye(4), EY),
+            JointPlacement(Joint("pivot", "R"), np.eye(4), placement.EY),
+            JointPlacement(
+                Joint("universal1", "R"), placement.translate(0.0, 0.0, self.post), placement.EX
+            ),
+            JointPlacement(Joint("universal2", "R"), np.eye(4), placement.EY),
         )
         limbs = (
-            build_carriage_limb(1, translate(-b), translate(-a), *of_rods, "", axes),
+            build_carriage_limb(
+                1, placement.translate(-b), placement.translate(-a), *of_rods, "", axes
+            ),
             build_carriage_limb(2, *second, *of_rods, "x", axes),
-            place_limb("chain3", steps, np.eye(4), "rigid", np.eye(4)),
+            placement.place_limb("chain3", steps, np.eye(4), "rigid", np.eye(4)),
         )
 
         def list_errors() -> Iterator[ErrorModel]:
             yield carriage_errors(limbs[0], 1, spread)
             yield carriage_errors(limbs[1], 2, spread, joint="yz")
             of_post = limbs[2], "universal1", "z", spread.select(Dimension.LENGTH)
-            yield displacement_error("r", *of_post, positive=True)
+            yield placement.displacement_error("r", *of_post, positive=True)
             angle = spread.select(Dimension.ANGLE)
             left_out = LEFT_OUT if self.parameter_set == "twenty-five" else ()
             for name, element, axis in POST_ANGLES:
                 if name not in left_out:
-                    yield displacement_error(name, limbs[2], element, axis, angle)
+                    yield placement.displacement_error(name, limbs[2], element, axis, angle)
 
         return self.join(limbs, list_errors(), "phi", "theta")
 
@@ -238,8 +229,9 @@ class ThreePrs(CarriageRobot):
 
     def expand(self) -> Assembly:
         """Return three PRS limbs under a free platform."""
-        base, platform = translate(self.base_radius), translate(self.platform_radius)
-        turns = [rotate_about(EZ, 2 * np.pi / 3 * k) for k in range(3)]
+        base = placement.translate(self.base_radius)
+        platform = placement.translate(self.platform_radius)
+        turns = [placement.rotate_about(placement.EZ, 2 * np.pi / 3 * k) for k in range(3)]
         home, axes, spread = self.home.matrix, self.spherical == "axes", self.tolerances
         limbs = [
             build_carriage_limb(k, T @ base, T @ platform, self.rod, home, "y", axes)

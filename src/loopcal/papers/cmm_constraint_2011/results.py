@@ -36,14 +36,10 @@ from loopcal.numerics.decomposition import are_nonzero
 from loopcal.papers import published
 from loopcal.papers.paper import PAPERS, StudyCase
 from loopcal.papers.published import PaperFile, Row, decide, decide_each, decide_share
+from loopcal.planning import plane_line_planning
 from loopcal.planning.design_space import ObservableSpace, PriorInformation, find_observable_space
 from loopcal.planning.exchange import MovedDesign
-from loopcal.planning.plane_line_planning import (
-    PlaneLineGroups,
-    improve_groups,
-    list_axes,
-    make_plane_line_instrument,
-)
+from loopcal.planning.plane_line_planning import PlaneLineGroups
 from loopcal.studies.simulation.block import calibrate_cells, set_size
 from loopcal.studies.simulation.machines import build_robot_of, measure_held_points
 from loopcal.studies.simulation.published_steps import Layout, linearize_products, map_displacements
@@ -252,7 +248,7 @@ def plan_points(grid: GridStudy, level: PosesLevel | None = None) -> Study:
         int(are_nonzero(s, SQUARED_ROUNDING).sum())
         for s in (find_directions(planned, x).singular_values for x in (first, more))
     )
-    improved = improve_groups(planned, first, level.sweeps, known == possible)
+    improved = plane_line_planning.improve_groups(planned, first, level.sweeps, known == possible)
     coordinates = planned.place_points(improved.design).reshape(level.count, -1)
     held = replace(level, coordinates=tuple(map(tuple, coordinates.tolist())))
     return Study(replace(grid, poses={name: held}), planned, first, improved)
@@ -435,8 +431,8 @@ def list_undetermined(study: Study) -> list[tuple[str, float]]:
     """
     robot, layout = study.robot, study.layout
     rows = study.optimized.rows.reshape(-1, len(study.planned.free))
-    axes, number = list_axes(study.optimized.design), np.arange(layout.points)
-    instrument = make_plane_line_instrument(
+    axes, number = plane_line_planning.list_axes(study.optimized.design), np.arange(layout.points)
+    instrument = plane_line_planning.make_plane_line_instrument(
         robot, axes, number.reshape(layout.groups, -1), lambda _, n: Gaussian(np.full(n, MM))
     )
     exact = measure_held_points(layout, robot.values[None], instrument, 0, is_exact=True)

@@ -37,15 +37,10 @@ from loopcal.io.formats.linkages.tree import (
     make_end,
     require_links,
 )
+from loopcal.mechanism.joint_graph import paths
 from loopcal.mechanism.joint_graph.graph import Coupling, GraphJoint, list_axes_across, turn_between
 from loopcal.mechanism.joint_graph.loops import JointGraph
-from loopcal.mechanism.joint_graph.paths import (
-    Bodies,
-    Weld,
-    assemble_graph,
-    couple_joints,
-    weld_bodies,
-)
+from loopcal.mechanism.joint_graph.paths import Bodies, Weld
 from loopcal.plain_text import quote
 from loopcal.typing import FloatArray
 
@@ -151,11 +146,11 @@ def read_mechanism(tree: LinkTree, path: Path | None) -> Linkage:
     links = [_find_link(tree, name) for pair in closures.pairs for name in pair]
     ends = frozenset(link for link in links if link is not None)
     try:
-        bodies = weld_bodies(tree.root, welds)
-        graph = assemble_graph(tree.root, [bodies.move(joint) for joint in joints], motors)
+        bodies = paths.weld_bodies(tree.root, welds)
+        graph = paths.assemble_graph(tree.root, [bodies.move(joint) for joint in joints], motors)
         known = tree.joints.values()
         couplings = [Coupling(j.name, *j.mimic) for j in known if j.mimic is not None and j.kind]
-        graph, left = couple_joints(graph, couplings)
+        graph, left = paths.couple_joints(graph, couplings)
     except MechanismError as error:
         # at the line of the closure that the error names
         finding = error.finding
