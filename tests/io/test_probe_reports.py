@@ -395,8 +395,13 @@ def test_a_wrong_height_is_named_with_the_option_that_leaves_it_out(capsys) -> N
     heights[6] += 0.6
     write_points(POINTS, heights)
     assert run("import m503.gcode --probes report.txt -o p.yaml --data h.csv") == 0
+    capsys.readouterr()
     assert run("calibrate p.yaml h.csv") == 0
-    assert "Hint: use --drop 7, or --loss huber" in capsys.readouterr().out
+    screen = capsys.readouterr().out
+    assert "Hint: use --drop 7, or --loss huber" in screen
+    assert screen.count("--drop 7") == 1
+    sentences = [s for s in " ".join(screen.split()).split(". ") if len(s.split()) > 3]
+    assert len(sentences) == len(set(sentences))  # nothing is said twice
 
 
 def test_joined_logs_without_dates_are_named_as_a_cause(capsys) -> None:
