@@ -488,7 +488,7 @@ def test_values_that_turn_the_base_frame_are_named_and_others_keep_it(capsys) ->
     assert "These values turn all of a program by 1." in " ".join(capsys.readouterr().out.split())
     assert run("export run --format reprap -o kept.g --keep-frame --force") in (0, 2)
     told = " ".join(capsys.readouterr().out.split())
-    assert "All values of this robot move programs" in told
+    assert "Set the origin of programs and the tool again" in told
     assert "--keep-frame" not in told
     targets = 1e-3 * np.array([[x, y, 0.0] for x, y in POINTS])
     readings, turns, heights = inverse(robot, targets).q, [], []
