@@ -47,7 +47,7 @@ def test_the_page_quotes_what_check_says_of_a_spinning_leg(tmp_path, capsys, roo
     assert main(["check", str(tmp_path / "robot.yaml")]) == 0
     said = " ".join(capsys.readouterr().out.split())
     page = " ".join((root / "docs" / "robots.md").read_text("utf-8").split())
-    quoted = re.findall(r'says of each leg: "(.*?)"', page)[0]
+    quoted = re.findall(r'says of each leg between two ball joints: "(.*?)"', page)[0]
     assert quoted in said
 
 

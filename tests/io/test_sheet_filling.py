@@ -396,7 +396,7 @@ def test_command_prints_what_is_filled_in_and_what_is_not(
     assert main(words.split()) == 0
     said = " ".join(capsys.readouterr().out.split())
     assert "measured.csv: wrote 39 points at 13 of 14 poses" in said
-    assert "and their cells stay empty: 1_SMR1, 1_SMR2 and 1_SMR3" in said
+    assert "or check their names: 1_SMR1, 1_SMR2 and 1_SMR3" in said
     assert "points.txt:44 does not match: it names the pose 'floor', but no target" in said
     assert main([*words.split(), "--force", "--profile", "leicca"]) == 1
     assert "faro, leica, spatial-analyzer and wide" in capsys.readouterr().err
