@@ -145,7 +145,8 @@ def _solve(
     fit = solve(residual, start, jacobian, method="lm", x_scale=unit, xtol=1e-12, ftol=1e-15)
     R = np.linalg.qr(fit.jac * unit, mode="r")
     root = unit[:, None] * np.linalg.inv(R)
-    return fit.x, root @ root.T
+    # one more step, which MINPACK refuses where rounding of the sum of squares hides its gain
+    return fit.x - root @ (root.T @ fit.grad), root @ root.T
 
 
 def make_jax_fit(start: np.ndarray, unit: np.ndarray, rows: np.ndarray) -> Callable[[], Answer]:

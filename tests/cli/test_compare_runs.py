@@ -199,7 +199,7 @@ def test_page_shows_the_comparison_without_programs_and_requests(loopcal, monkey
         "The runs share no held-out pose",
     ):
         assert words in text
-    assert len(re.findall(r"<figure>\s*<svg", text)) == 3
+    assert len(re.findall(r"<figure[^>]*>\s*<svg", text)) == 3
     assert "<script" not in text
     assert re.search(r"\sstyle=|\son[a-z]+=|https?://", text) is None
     assert read_policy(text).startswith("default-src 'none'; style-src 'sha256-")
