@@ -122,8 +122,8 @@ class HeldOutBlocks(NamedTuple):
 
     def combine(self, excluded: BoolArray) -> Prediction:
         """Return the prediction by the blocks that are not excluded."""
-        k, factors = self.shared, NodeFactors(self.tree, 1, self.shared)
-        factors.most = np.inf  # these rows are in memory
+        k = self.shared
+        factors = NodeFactors(self.tree, 1, k, most=np.inf)  # these rows are in memory
         for i, structure in enumerate(self.tree.structures):  # of variance 1
             n, u = structure.unknowns.shape
             unit, rest = np.eye(u, structure.width), np.zeros((1, n, u, k + 1))

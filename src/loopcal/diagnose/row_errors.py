@@ -408,7 +408,7 @@ class PosePredictions:
     def residuals(self, observations: Sequence[Observations]) -> list[FloatArray]:
         """Return the prediction errors (r, m) of every kind."""
         return [
-            o.kind.compute_residuals(self.T[:, o.rows], o.measured[None], *self._inputs_of(i, o))[0]
+            o.compute_residuals(self.T, *self._inputs_of(i, o))[0]
             for i, o in enumerate(observations)
         ]
 

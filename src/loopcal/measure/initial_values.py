@@ -188,8 +188,7 @@ def find_equal_values(
     cost = np.zeros((len(others), len(used)))
     for i, rows in enumerate(observations):
         if len(rows) and nuisance.indices[i].shape[1]:
-            own = T[None, rows.rows], rows.measured[None], nuisance.select(i, others)
-            residual = rows.kind.compute_residuals(*own)
+            residual = rows.compute_residuals(T[None], nuisance.select(i, others))
             square = ((rows.whitener @ residual[..., None]) ** 2).sum(axis=(2, 3))
             of = cluster[nuisance.indices[i]].max(axis=1)
             np.add.at(cost.T, of[of >= 0], square.T[of >= 0])

@@ -431,6 +431,12 @@ class Observations:
         """
         return self.kind.evaluate(T[:, self.rows], self.measured[None], nuisance, joints)
 
+    def compute_residuals(
+        self, T: FloatArray, nuisance: FloatArray | None = None, joints: FloatArray | None = None
+    ) -> FloatArray:
+        """Return the residuals (t, r, m) of `evaluate`."""
+        return self.kind.compute_residuals(T[:, self.rows], self.measured[None], nuisance, joints)
+
     def take(self, keep: ArrayLike, poses: IntArray | None = None) -> Self:
         """Return the rows at these indices, or of this mask; `poses` are the indices of the poses
         of these, by default the present ones. They are not checked again.

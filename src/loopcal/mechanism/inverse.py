@@ -450,10 +450,12 @@ def _solve_by_drives(
 
 
 def _make_rows(robot: Mechanism, values: FloatArray, target: FloatArray) -> _Rows:
-    """Return rows with values (1 | R, p) and targets (R, c)."""
+    """Return rows with values (1 | R, p) and targets (R, c). Those of one set are kept."""
     rows: _Rows | None = robot.derived.get("rows")
     if rows is None or not np.array_equal(values, rows.values):
-        rows = robot.derived["rows"] = _place_rows(robot, values)
+        rows = _place_rows(robot, values)
+        if len(values) == 1:
+            robot.derived["rows"] = rows
     return replace(rows, target=target, sign=np.zeros(len(target)))
 
 

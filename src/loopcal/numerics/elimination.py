@@ -240,10 +240,12 @@ class NodeFactors:
     tree: EliminationTree
     trials: int
     parameters: int
-    most: float = 4e6
+    most: float
 
-    def __init__(self, tree: EliminationTree, trials: int, parameters: int) -> None:
-        self.tree, self.trials, self.parameters = tree, trials, parameters
+    def __init__(
+        self, tree: EliminationTree, trials: int, parameters: int, most: float = 4e6
+    ) -> None:
+        self.tree, self.trials, self.parameters, self.most = tree, trials, parameters, most
         self._factors: list[FloatArray] = [
             np.zeros((trials, len(s), 0, s.width + parameters + 1)) for s in tree.structures
         ]

@@ -415,8 +415,7 @@ def guess_frames(
     sizes = [np.zeros((h, 0))]
     for o, places in zip(data.observations, nuisance.indices, strict=True):
         if len(o) and not o.kind.sensed_joints:
-            at = T[:, o.rows], o.measured[None], start[:, places]
-            residual = o.kind.compute_residuals(*at)
+            residual = o.compute_residuals(T, start[:, places])
             whitened = np.matmul(o.whitener, residual[..., None])[..., 0]
             sizes.append(np.linalg.norm(whitened, axis=-1))
     size = np.concatenate(sizes, axis=1)
