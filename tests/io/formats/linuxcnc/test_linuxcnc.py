@@ -2,6 +2,7 @@
 """LinuxCNC's genhexkins settings: agreement with LinuxCNC's own code, import, export, refusals."""
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -116,9 +117,9 @@ def test_missing_pin_is_added(tmp_path, geometry) -> None:
 
 def test_export_reports_strut_lengths_without_a_pin() -> None:
     found = hal_file.write(ExportSource(load_robot("hexapod-42")), None)
-    sentences = [str(f) for f in found.findings if f.code == "files.strut-length"]
+    sentences = [str(f) for f in found.findings if f.code == "files.joint-position"]
     assert len(sentences) == 6
-    assert "Strut 0 is 233.238076 mm longer than its reading" in sentences[0]
+    assert "At reading 0 joint 0 is at 233.238076 mm" in sentences[0]
     assert "HOME_OFFSET of [JOINT_0]" in sentences[0]
 
 
@@ -131,3 +132,45 @@ def test_screws_with_different_leads_are_refused(tmp_path, geometry) -> None:
     )
     with pytest.raises((DataError, FileError), match="screws of different lead"):
         hal_file.write(ExportSource(load_robot(tmp_path / "two.yaml")), None)
+
+
+DELTA = "loadrt lineardeltakins\nsetp lineardeltakins.R 130.25 # rods\nsetp lineardeltakins.L=269\n"
+
+
+def test_a_delta_has_the_formula_of_lineardeltakins(tmp_path) -> None:
+    robot = read(tmp_path, DELTA)
+    points = np.random.default_rng(1).uniform(-60, 60, (20, 3))
+    towers = np.radians([90, 210, 330])
+    away = points[:, None, :2] - 130.25 * np.column_stack([np.cos(towers), np.sin(towers)])
+    wanted = points[:, 2:] + np.sqrt(269**2 - (away**2).sum(2))
+    np.testing.assert_allclose(inverse(robot, points * 1e-3).q * 1e3, wanted, rtol=0, atol=1e-9)
+
+
+def test_the_file_of_a_delta_gets_its_pins_and_the_rest_is_reported(tmp_path) -> None:
+    robot, path = read(tmp_path, DELTA), tmp_path / "hexapod.hal"
+    changes = {"radius": 0.5e-3, "tower1.angle": 1e-3, "tower2.stop": 2e-3}
+    changes |= {f"arm{k}.length": 0.1e-3 * k for k in (1, 2, 3)}
+    added = np.array([changes.get(name, 0.0) for name in robot.parameters.names])
+    source = ExportSource(robot.with_values(robot.values + added))
+    written = hal_file.write(source, path)
+    pins = [float(number) for number in re.findall(r"[ =](\d\S*)", written.text)]
+    assert pins == pytest.approx([130.75, 269.2], rel=1e-14)
+    assert "130.75 # rods\n" in written.text
+    (lost,) = [f.data["names"] for f in written.findings if f.code == "files.not-expressed"]
+    assert lost == ("tower1.angle", "arm1.length", "arm3.length")
+    # where the carriages are with the nozzle at its stops: joint 1 by its stop, all by the rods
+    rises = [np.sqrt(rod**2 - radius**2) for rod, radius in ((269.2, 130.75), (269, 130.25))]
+    change = rises[0] - rises[1] + np.array([0, 2, 0])
+    (tmp_path / "machine.ini").write_text(
+        "".join(f"[JOINT_{n}]\nHOME_OFFSET = 400 # {n}\n" for n in range(3))
+    )
+    lines = hal_file.write_ini(source, tmp_path / "machine.ini").text.splitlines()
+    offsets = [float(line.split()[2]) for line in lines[1::2]]
+    np.testing.assert_allclose(offsets, 400 + change, rtol=0, atol=1e-6)
+    with pytest.raises(FileError, match="no 'setp genhexkins"):  # the file is of another machine
+        hal_file.write(ExportSource(load_robot("hexapod-42")), path)
+    turned = np.where(["angle" in name for name in robot.parameters.names], 0.3, robot.values)
+    with pytest.raises(DataError, match="a third of a turn apart"):
+        hal_file.write(ExportSource(robot.with_values(turned)), None)
+    with pytest.raises(FileError, match=r"hexapod.hal:3: R is 130.25 and L is 100"):
+        read(tmp_path, DELTA.replace("269", "100"))

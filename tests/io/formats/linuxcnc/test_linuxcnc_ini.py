@@ -77,7 +77,7 @@ def test_files_without_what_is_needed_are_refused(source, tmp_path) -> None:
     with pytest.raises(FileError, match=r"machine.ini:4: LINEAR_UNITS is 'furlong'. Allowed: mm"):
         export(source, file)
     with pytest.raises(DataError, match="the format linuxcnc-ini holds"):
-        export(ExportSource(load_robot("linear-delta")), file)
+        export(ExportSource(load_robot("core-xy")), file)
 
 
 def test_readings_that_are_lengths_need_the_file(tmp_path) -> None:

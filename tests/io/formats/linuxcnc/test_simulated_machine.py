@@ -17,7 +17,7 @@ import pytest
 
 import loopcal as lc
 from loopcal.apply.compensation import TableSize, make_tables
-from loopcal.io.formats import linuxcnc as genhexkins
+from loopcal.io.formats import linuxcnc
 from loopcal.io.formats.correction_files import write_compensation
 from loopcal.io.formats.linuxcnc_kinematics import NAME, write
 from loopcal.io.formats.program_format import ExportSource
@@ -130,17 +130,21 @@ def calibrated(tmp_path_factory: pytest.TempPathFactory) -> Calibrated:
     """A hexapod with scale errors of its screws, calibrated by 60 measured poses."""
     shipped = (Path(lc.__file__).parent / "robots" / "hexapod-42.yaml").read_text("utf-8")
     robot = load_text(tmp_path_factory.mktemp("robot"), shipped + GAINS)
+    noise = lc.Gaussian(np.repeat([5e-6, 2e-5], 3))
+    return calibrate(robot, lc.Sensor(lc.Pose(), noise))
+
+
+def calibrate(robot: lc.Mechanism, sensor: lc.Sensor) -> Calibrated:
+    """Return a machine with errors of its tolerances, calibrated by 60 measured poses."""
     spread = np.nan_to_num(robot.parameters.tolerance) * robot.parameters.free
     errors = spread * np.random.default_rng(3).standard_normal(len(spread))
     truth = robot.with_values(robot.values + errors)
-    sample = lc.sample_workspace(robot, 60 + POSES, 1)
-    target = sample.coordinates.copy()
-    noise = lc.Gaussian(np.repeat([5e-6, 2e-5], 3))
-    tracker = lc.Instrument((lc.Sensor(lc.Pose(), noise),))
+    target = lc.sample_workspace(robot, 60 + POSES, 1).coordinates
+    tracker = lc.Instrument((sensor,))
     report = lc.calibrate(robot, lc.simulate(truth, target[:60], tracker, seed=2))
     fit = report.identification
-    covariance = lc.pose_uncertainty(fit, target[60:], frame="base").covariance[:, 3:, 3:]
-    return Calibrated(truth, fit.robot, target[60:] / UNITS, covariance)
+    covariance = lc.pose_uncertainty(fit, target[60:], frame="base").covariance[:, -3:, -3:]
+    return Calibrated(truth, fit.robot, target[60:] / UNITS[: target.shape[1]], covariance)
 
 
 @pytest.fixture
@@ -161,10 +165,11 @@ def run_linuxcnc(
     poses: np.ndarray,
     compensation: Mapping[str, str] = MappingProxyType({}),
 ) -> np.ndarray:
-    """Return positions of joints and of their motors (2, n, 6) [mm] after moves to poses, from a
-    home. `compensation` : name -> text of the file of each joint, none by default.
+    """Return positions of joints and of their motors (2, n, k) [mm] after moves to poses (n, k),
+    from a home (k). `compensation` : name -> text of the file of each joint, none by default.
     """
-    joints = [f"net J{j} joint.{j}.motor-pos-cmd => joint.{j}.motor-pos-fb" for j in range(6)]
+    count, axes = len(homes), "XYZABC"[: len(homes)]
+    joints = [f"net J{j} joint.{j}.motor-pos-cmd => joint.{j}.motor-pos-fb" for j in range(count)]
     lines = [
         f"loadrt {kinematics}",
         "loadrt [EMCMOT]EMCMOT servo_period_nsec=[EMCMOT]SERVO_PERIOD num_joints=[KINS]JOINTS",
@@ -173,8 +178,8 @@ def run_linuxcnc(
         *joints,
         "net estop iocontrol.0.user-enable-out iocontrol.0.emc-enable-in",
     ]
-    text = SETTINGS + f"KINEMATICS = {kinematics}\nJOINTS = 6\n"
-    text += "".join(map(AXIS.format, "XYZABC"))
+    text = SETTINGS.replace("XYZABC", axes) + f"KINEMATICS = {kinematics}\nJOINTS = {count}\n"
+    text += "".join(map(AXIS.format, axes))
     for j, home in enumerate(homes.tolist()):
         text += JOINT.format(j, home, home)
         if (name := f"table-joint{j}.comp") in compensation:
@@ -183,7 +188,7 @@ def run_linuxcnc(
         place = Path(name)
         (place / "machine.ini").write_text(text)
         (place / "machine.hal").write_text("\n".join(lines) + "\n" + hal + "\n")
-        (place / "moves.json").write_text(json.dumps([poses.tolist(), 6]))
+        (place / "moves.json").write_text(json.dumps([poses.tolist(), count]))
         (place / "driver.py").write_text(DRIVER)
         for file, content in compensation.items():
             (place / file).write_text(content)
@@ -200,7 +205,7 @@ def run_linuxcnc(
 
 
 def measure_errors(calibrated: Calibrated, readings: np.ndarray) -> np.ndarray:
-    """Return how far (n, 3) [m] the true machine stands from the poses at readings (n, 6) [m]."""
+    """Return how far (n, 3) [m] the true machine stands from the poses at readings (n, k) [m]."""
     reached = lc.forward(calibrated.truth, readings).T
     return reached[:, :3, 3] - calibrated.poses[:, :3] * MM
 
@@ -220,7 +225,7 @@ def test_the_component_moves_the_true_machine_to_the_commanded_poses(
     assert square.max() < 21.1  # chi-square of three, exceeded with 1e-4
 
     # genhexkins has the corrected joint centers, but no scale of a screw
-    pins = genhexkins.write(source, None).text
+    pins = linuxcnc.write(source, None).text
     lengths = calibrated.identified
     starts = (
         np.array(
@@ -233,6 +238,30 @@ def test_the_component_moves_the_true_machine_to_the_commanded_poses(
     rms, of_old = (float(np.sqrt((e**2).sum(axis=1).mean())) for e in (errors, left))
     assert rms < 10e-6
     assert of_old > 5 * rms
+
+
+def test_lineardeltakins_leaves_what_its_two_pins_cannot_hold(component: Path) -> None:
+    machine = calibrate(
+        lc.load_robot("linear-delta"), lc.Sensor(lc.Position(), lc.Gaussian(np.full(3, 5e-6)))
+    )
+    source, own = ExportSource(machine.identified), machine.identified
+    component.write_text(write(source, None).text, "utf-8")
+    subprocess.run(["halcompile", "--install", component], check=True, capture_output=True)
+    homes = lc.inverse(own, own.home[None]).q[0]
+    joints = run_linuxcnc(NAME, "", homes / MM, machine.poses)[0] * MM
+    assert np.abs(joints - lc.inverse(own, machine.poses * MM).q).max() < 1e-6 * MM
+    exact = measure_errors(machine, joints)
+    # its joints are heights of carriages, counted from HOME_OFFSET, of towers at 90, 210, 330 deg
+    exported = linuxcnc.write(source, None)
+    lines = linuxcnc.write_ini(source, None).text.splitlines()
+    zeros, towers = np.array([float(line.split("=")[1]) for line in lines[1::2]]), [2, 0, 1]
+    heights = run_linuxcnc(
+        "lineardeltakins", exported.text, zeros - homes[towers] / MM, machine.poses
+    )[0]
+    left = measure_errors(machine, ((zeros - heights) * MM)[:, np.argsort(towers)])
+    rms, of_pins = (float(np.sqrt((e**2).sum(axis=1).mean())) for e in (exact, left))
+    assert rms < 5e-6
+    assert of_pins > 50 * rms
 
 
 def test_a_pin_changes_a_parameter_without_compiling(
