@@ -178,8 +178,8 @@ def test_existing_file_is_replaced_only_with_force(loopcal, folder, data_folder)
             "holds a robot of the family linear-delta, not",
         ),
         (
-            "export linear-delta --format linuxcnc -o x.hal",
-            "holds a hexapod of the family gough, not",
+            "export core-xy --format linuxcnc -o x.hal",
+            "holds a hexapod (family gough) or a delta (family linear-delta), not",
         ),
         ("export linear-delta -o x.csv --into y.csv", "the format csv makes a new file"),
         (

@@ -195,7 +195,7 @@ BAD_EXPORTS = {
          "'1.5' is "
         "not a number for 'x'"),
     ),
-    "a header alone": ("Name;X;Y;Z\n", "the profile skips every line"),
+    "a header alone": ("Name;X;Y;Z\n", "this export has no rows, only headers"),
     "another encoding": ("Name;X;Y;Z\nø1;1;2;3\n".encode("latin-1"), ("export.txt:2: byte 0xf8 is "
                                                                      "not utf-8.*'encoding'")),
     "a header twice": ("Name;X;X;Y;Z\nP;1;1;2;3\n", "export.txt:1: duplicate column 'X'"),

@@ -227,6 +227,17 @@ def test_a_growing_export_gives_complete_sets_of_targets_once(
     assert len(again.rows) == 1
 
 
+def test_a_followed_export_may_begin_with_its_header(robot, sheet, points, tmp_path) -> None:
+    path, entry = tmp_path / "points.csv", read_sheet(sheet, robot)[1]
+    export = GrowingExport(path, read_profile(find_profile_file("faro")), entry)
+    header = "Name,X,Y,Z"
+    path.write_text(header + "\n")
+    begun = read_new_rows(export)
+    assert (begun.rows, begun.findings) == ((), [])
+    path.write_text(header + "\nnonsense\n")
+    assert [f.code for f in read_new_rows(begun.export).findings] == ["session.no-line-matches"]
+
+
 def test_points_sorted_by_target_come_to_their_poses(robot, sheet, points, tmp_path) -> None:
     by_target = sorted(points, key=lambda point: point[0].split("_")[1])
     filled = fill(robot, sheet, write_spatial_analyzer(tmp_path / "e.txt", by_target))

@@ -178,6 +178,18 @@ def test_rows_in_another_unit_are_named_and_not_used() -> None:
     assert state.pending == (machine.fit[0],)
 
 
+def test_rows_in_another_unit_are_not_corrected_in_the_header_of_their_sheet() -> None:
+    """A sheet with another header would begin another session."""
+    machine = Machine("linear-delta", ("base",), 1)
+    poses = [pose for pose in machine.fit[:8] for _ in range(2)]
+    exact = machine.exact.observations[0].measured[poses]
+    _, verdicts = follow(machine, poses, dict(enumerate(24.4 * exact)))
+    found = [finding for verdict in verdicts for finding in verdict.findings]
+    said = [str(f) for f in found if f.code == "conventions.other-interpretation"]
+    assert said
+    assert all("Measure again with the units" in text and "header" not in text for text in said)
+
+
 def test_rows_that_contradict_each_other_are_measured_again() -> None:
     wrong = {6: (1e-3, 0.0, 0.0), 7: (0.0, 1e-3, 0.0)}
     machine = make_machine()

@@ -461,7 +461,8 @@ def examine_row(before: Companion, measured: Measurements, pose: int) -> Verdict
         used[suspects] = len(suspects) > 1
         return conclude("earlier-wrong", suspects=tuple(task.labels[poses[i]] for i in suspects))
     check = compare_conventions(task.robot, measured.take(used))
-    others = () if check.finding is None else (check.finding,)
+    found = check.finding
+    others = () if found is None else (replace(found, data={**found.data, "is_session": True}),)
     if check.is_refused or (others and not before.is_used.any()):  # such as another unit
         used[[*same, n - 1]] = False
         return conclude("misread", *others)
@@ -566,7 +567,7 @@ def _describe_worst(
     ratio = np.nan_to_num(np.abs(prediction.difference) / prediction.sd)
     worst, times = int(ratio.argmax()), float(np.sqrt(prediction.distance))
     name, difference, sd = "", None, None
-    if ratio[worst] > 0.0:
+    if ratio[worst] > 0.01:  # less is shown as none
         name, times = prediction.names[worst], float(ratio[worst])
         dimension = observed.kind.noise_columns[worst].dimension
         pair = prediction.difference[worst], prediction.sd[worst]

@@ -124,7 +124,11 @@ def other_measurements(data: Data) -> str:
 
 
 def correction(data: Data) -> str:
-    """Return what to correct where the data fit in another interpretation."""
+    """Return what to correct where the data fit in another interpretation; the header of a session
+    is that of its sheet.
+    """
+    if data.get("is_session"):
+        return word_phrase("session_correction", data)
     slip = data["interpretation"]
     return " ".join(
         fill_template(find_entry(part["code"]).action, **part)

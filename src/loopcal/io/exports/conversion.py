@@ -401,7 +401,7 @@ def convert_export(
     misfits.sort()
     if not rows:
         if not misfits:
-            raise FileError("the profile skips every line of this export. Correct it", path)
+            raise FileError.of("files.export-without-rows", path)
         number, reason = misfits[0]
         sentence = f"no line of this export fits {profile.file.path}"
         if read[0].header is None and not fitting:

@@ -79,6 +79,8 @@ def read_new_rows(export: GrowingExport) -> NewRows:
             path, export.profile, export.entry, export.by_order, misfits, content
         )
     except FileError as error:  # a header alone, or lines that do not match
+        if error.code == "files.export-without-rows":
+            return NewRows(after, findings=findings)
         if not export.misfits:
             findings.append(report_finding("session.no-line-matches", reason=str(error)))
         return NewRows(replace(after, misfits=1), findings=findings)
