@@ -47,7 +47,8 @@ def mutate_arrays(content: bytes, rng: Random) -> tuple[bytes, str]:
 def _retype(array: np.ndarray, kind: Any) -> np.ndarray:
     """Return an array of another type; where its values do not become numbers, zeros."""
     is_text = array.dtype.kind in "US"
-    return np.zeros(array.shape, kind) if is_text and kind is not object else array.astype(kind)
+    with np.errstate(invalid="ignore"):  # what is no number becomes any integer
+        return np.zeros(array.shape, kind) if is_text and kind is not object else array.astype(kind)
 
 
 def _reshape(array: np.ndarray, rng: Random) -> np.ndarray:

@@ -19,7 +19,7 @@ from tools.fuzz.stores import mutate_store
 from tools.fuzz.surroundings import draw_surroundings
 from tools.fuzz.tables import Table, mutate_table, read_table, write_table
 from tools.fuzz.texts import mutate_text
-from tools.fuzz.trees import Tree, mutate_tree, write_json, write_yaml
+from tools.fuzz.trees import Trees, mutate_tree, write_json, write_yaml
 
 MACHINE_WEIGHTS = {"five-bar": 4, "linear-delta": 4, "exports": 2, "programs": 4, "study": 2}
 """How often a machine is drawn, 1 by default. The small ones cost least."""
@@ -63,9 +63,9 @@ class Maker:
         return list_commands()
 
     @cached_property
-    def trees(self) -> list[Tree]:
+    def trees(self) -> Trees:
         """What the YAML and JSON files of all machines contain."""
-        return [tree for machine in self.machines for tree in machine.trees.values()]
+        return Trees(tree for machine in self.machines for tree in machine.trees.values())
 
     @cached_property
     def tables(self) -> dict[tuple[str, str], Table]:

@@ -18,8 +18,8 @@ STUDY = """\
 format: 1
 title: A study
 seed: 3
-replicates: 4
-block: 2
+replicates: 2
+block: 1
 robots: [robot.yaml]
 instruments:
   tracker: {kinds: [position], sigma_position: 20 um}
@@ -36,7 +36,7 @@ effects:
 scores: {held_out: 2}
 questions:
   noise: {factor: noise, score: position, limit: 0.1 mm, wanted: largest}
-quick: {replicates: 2, instruments: {tracker: {kinds: [position]}}}
+quick: {replicates: 1, instruments: {tracker: {kinds: [position]}}}
 """
 POSES = "pose,x [mm],y [mm]\na,10,320\nb,-50,350\nc,0,300\nd,30,310\n"
 
@@ -48,12 +48,12 @@ LINES = """
     3 study run study.yaml -o results --resume --workers 1
     1 study run study.yaml -o out --cells 2/3 --workers 1
     3 study status results
-    4 study summary results
-    1 study summary results --score position --against poses
+    1 study summary results
+    0.3 study summary results --score position --against poses
     3 study ask results --smallest noise --limit 100um
     1 study ask results --largest noise --limit 1mm --score position_max --json
     3 study export results -o out.csv
-    3 study extend results --replicates 6 --workers 1
+    3 study extend results --replicates 3 --workers 1
     3 study merge results part -o out
     2 study merge part -o results
     3 study replay results 1/2 -o out

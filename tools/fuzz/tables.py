@@ -5,12 +5,12 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from random import Random
 from typing import Any
 
-from tools.fuzz.trees import Tree, mutate_tree, write_yaml
+from tools.fuzz.trees import Tree, Trees, mutate_tree, write_yaml
 from tools.fuzz.values import CELLS, WINDOWS_PATHS, change_number, draw_name
 
 UNITS = (
@@ -56,7 +56,7 @@ def read_table(content: bytes, parse: Callable[[str], Tree]) -> Table:
     return Table(parse("\n".join(remarks)), header, rows)
 
 
-def mutate_table(table: Table, rng: Random, others: Sequence[Tree]) -> tuple[Table, str]:
+def mutate_table(table: Table, rng: Random, others: Trees) -> tuple[Table, str]:
     """Return a damaged copy of a table, and the name of the damage."""
     copied = Table(table.settings, list(table.header), [list(row) for row in table.rows])
     if isinstance(table.settings, dict) and rng.random() < 0.35:

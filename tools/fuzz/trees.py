@@ -6,7 +6,8 @@ from __future__ import annotations
 import copy
 import json
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
+from functools import cached_property
 from random import Random
 from typing import Any
 
@@ -15,6 +16,15 @@ from tools.fuzz.values import DEPTHS, Raw, change_number, draw_name, draw_value
 Tree = Any
 Place = tuple[Any, Any]
 """A mapping or a list, and the key or index in it."""
+
+
+class Trees(list[Tree]):
+    """Trees of files that do not change, with the keys of all their mappings."""
+
+    @cached_property
+    def keys(self) -> list[str]:
+        """Every key of a mapping, as often as it occurs."""
+        return [str(k) for tree in self for node, k in list_places(tree) if isinstance(node, dict)]
 
 
 def list_places(tree: Tree) -> list[Place]:
@@ -35,7 +45,7 @@ def _walk(node: Tree) -> Iterator[Place]:
         yield from _walk(value)
 
 
-def mutate_tree(tree: Tree, rng: Random, others: Sequence[Tree]) -> tuple[Tree, str]:
+def mutate_tree(tree: Tree, rng: Random, others: Trees) -> tuple[Tree, str]:
     """Return a damaged copy of a tree, and the name of the damage.
 
     Parameters
@@ -52,11 +62,11 @@ def mutate_tree(tree: Tree, rng: Random, others: Sequence[Tree]) -> tuple[Tree, 
     return tree, name
 
 
-def _replace(node: Any, key: Any, rng: Random, _others: Sequence[Tree]) -> None:
+def _replace(node: Any, key: Any, rng: Random, _others: Trees) -> None:
     node[key] = draw_value(rng)
 
 
-def _change(node: Any, key: Any, rng: Random, others: Sequence[Tree]) -> None:
+def _change(node: Any, key: Any, rng: Random, others: Trees) -> None:
     """Change a number, or a value below where there is one."""
     value = node[key]
     if isinstance(value, bool) or not isinstance(value, int | float):
@@ -68,11 +78,11 @@ def _change(node: Any, key: Any, rng: Random, others: Sequence[Tree]) -> None:
     node[key] = change_number(node[key], rng)
 
 
-def _delete(node: Any, key: Any, _rng: Random, _others: Sequence[Tree]) -> None:
+def _delete(node: Any, key: Any, _rng: Random, _others: Trees) -> None:
     del node[key]
 
 
-def _duplicate(node: Any, key: Any, rng: Random, _others: Sequence[Tree]) -> None:
+def _duplicate(node: Any, key: Any, rng: Random, _others: Trees) -> None:
     """Repeat an item of a list, or a value of a mapping under another key."""
     if isinstance(node, list):
         node.insert(rng.randrange(len(node) + 1), copy.deepcopy(node[key]))
@@ -80,19 +90,18 @@ def _duplicate(node: Any, key: Any, rng: Random, _others: Sequence[Tree]) -> Non
         node[rng.choice([draw_name(rng), f"{key}2", *map(str, node)])] = copy.deepcopy(node[key])
 
 
-def _rename(node: Any, key: Any, rng: Random, others: Sequence[Tree]) -> None:
+def _rename(node: Any, key: Any, rng: Random, others: Trees) -> None:
     """Rename a key, keeping its place; an item of a list becomes a name."""
     if isinstance(node, list):
         node[key] = draw_name(rng)
         return
-    keys = [str(k) for other in others for n, k in list_places(other) if isinstance(n, dict)]
-    new = rng.choice([draw_name(rng), *rng.sample(keys, min(2, len(keys)))])
+    new = rng.choice([draw_name(rng), *rng.sample(others.keys, min(2, len(others.keys)))])
     pairs = [(new if k == key else k, v) for k, v in node.items()]
     node.clear()
     node.update(pairs)
 
 
-def _reorder(node: Any, _key: Any, rng: Random, _others: Sequence[Tree]) -> None:
+def _reorder(node: Any, _key: Any, rng: Random, _others: Trees) -> None:
     """Shuffle a mapping or a list."""
     if isinstance(node, list):
         rng.shuffle(node)
@@ -103,7 +112,7 @@ def _reorder(node: Any, _key: Any, rng: Random, _others: Sequence[Tree]) -> None
     node.update(pairs)
 
 
-def _nest(node: Any, key: Any, rng: Random, _others: Sequence[Tree]) -> None:
+def _nest(node: Any, key: Any, rng: Random, _others: Trees) -> None:
     """Write a value into lists or mappings, perhaps many of them."""
     depth = rng.choices(DEPTHS, [6, 3, 2, 1, 1])[0]
     if depth > 40:
@@ -113,7 +122,7 @@ def _nest(node: Any, key: Any, rng: Random, _others: Sequence[Tree]) -> None:
         node[key] = [node[key]] if rng.random() < 0.7 else {"x": node[key]}
 
 
-def _transplant(node: Any, key: Any, rng: Random, others: Sequence[Tree]) -> None:
+def _transplant(node: Any, key: Any, rng: Random, others: Trees) -> None:
     """Write a part of another file here, under its own key where this is a mapping."""
     other = rng.choice([o for o in others if isinstance(o, dict | list) and o] or [{"x": 1}])
     source, name = rng.choice(list_places(other))
@@ -124,7 +133,7 @@ def _transplant(node: Any, key: Any, rng: Random, others: Sequence[Tree]) -> Non
         node[key] = part
 
 
-def _repeat(node: Any, key: Any, rng: Random, _others: Sequence[Tree]) -> None:
+def _repeat(node: Any, key: Any, rng: Random, _others: Trees) -> None:
     """Make a list much longer, or repeat a text."""
     value = node[key]
     if isinstance(value, list) and value:
@@ -133,7 +142,7 @@ def _repeat(node: Any, key: Any, rng: Random, _others: Sequence[Tree]) -> None:
         node[key] = str(value) * rng.choice([2, 50])
 
 
-Mutation = Callable[[Any, Any, Random, Sequence[Tree]], None]
+Mutation = Callable[[Any, Any, Random, Trees], None]
 MUTATIONS: dict[str, Mutation] = {
     "replace": _replace,
     "change": _change,
