@@ -3,17 +3,25 @@
 smallest that shows it, and the right answer.
 """
 
+import re
 import subprocess
 import sys
 import warnings
 from pathlib import Path
 
+import click
 import numpy as np
 import pytest
 
 import loopcal as lc
+from loopcal.diagnose.conventions.misfit import guess_frames
 from loopcal.diagnose.error_frames import fit_frames
+from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.io.robot.robot_file import find_robot_file
+from loopcal.measure.kinds.position import Position
+from tests.diagnose.test_conventions import simulate_data
+from tools.fuzz.commands import list_commands
+from tools.fuzz.study_corpus import POSES, STUDY
 
 DATA = """\
 # kind: {kind}
@@ -176,6 +184,54 @@ def test_document_of_a_result_folder_is_never_replaced_by_a_file(loopcal, tmp_pa
     loopcal([*words, str(document)], "whose folder needs it", code=1)
     assert document.read_bytes() == before
     loopcal([*words, str(other)])
+
+
+NUMBERS = [
+    (name, option.type)
+    for name, command in list_commands().items()
+    for option in command.params
+    if isinstance(option.type, click.types.IntParamType | click.types.FloatParamType)
+]
+
+
+@pytest.mark.parametrize("text", ["nan", "inf", "-inf", "1e400", "", "1,000", "1 000", "½"])
+def test_what_is_no_number_is_refused_as_no_number_by_every_option(text) -> None:
+    assert len(NUMBERS) > 40
+    for name, kind in NUMBERS:
+        with pytest.raises(click.BadParameter) as caught:
+            kind.convert(text, None, None)
+        said = caught.value.message
+        assert re.search(r"not a (valid (integer|number|share)|finite number)\.|[<>]", said), name
+        assert "None" not in said
+
+
+def test_summary_of_a_study_is_written_whole_or_not_at_all(loopcal, tmp_path) -> None:
+    (tmp_path / "study.yaml").write_text(STUDY.replace("robot.yaml", "five-bar"), "utf-8")
+    (tmp_path / "poses.csv").write_text(POSES, "utf-8")
+    loopcal("study run study.yaml -o results --quick --workers 1")
+    before = {path.name for path in (tmp_path / "results").iterdir()}
+    (tmp_path / "results/summary.csv").mkdir()
+    loopcal("study summary results", "results/summary.csv: this is a folder", code=1)
+    assert {path.name for path in (tmp_path / "results").iterdir()} == before | {"summary.csv"}
+
+
+def test_noise_that_no_fit_survives_is_no_warning(loopcal, tmp_path) -> None:
+    text = STUDY.replace("robot.yaml", "five-bar").replace("more: {noise: 2", "more: {noise: 1e308")
+    (tmp_path / "study.yaml").write_text(text, "utf-8")
+    (tmp_path / "poses.csv").write_text(POSES, "utf-8")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        loopcal("study check study.yaml --quick", "Failed trials: 4 of 4")
+
+
+def test_readings_that_reach_no_pose_in_any_interpretation_are_undecided() -> None:
+    robot = lc.load_robot("hexapod-octahedral")
+    kind = Position(targets=("a", "b", "c"), unknown=("frame", "targets"))
+    data = simulate_data("hexapod-octahedral", kind, n=8)
+    near, start, size = guess_frames(
+        select_free_parameters(robot), data, np.stack([data.readings + 1e3, data.readings - 1e3])
+    )
+    assert (near.shape, len(start), size.shape) == ((0,), 0, (0,))
 
 
 def test_motions_that_move_nothing_fit_nothing() -> None:

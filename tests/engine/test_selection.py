@@ -103,10 +103,15 @@ def test_engines_that_cannot_compute_are_refused_in_a_sentence(installed, choice
     assert repr(choice) in str(refusal.value)
 
 
-def test_a_wrong_name_ends_a_command_with_a_sentence(environment, capsys):
+def test_a_wrong_name_ends_a_command_with_a_sentence(environment, capsys, tmp_path):
+    """The sentence names no file: the variable is wrong, not what was read."""
     environment("nativ")
-    assert main(["check", "five-bar"]) == 1
-    assert "The engine 'nativ' is not installed" in capsys.readouterr().err
+    (tmp_path / "study.yaml").write_text(
+        "format: 1\ntitle: x\nseed: 1\nrobots: [five-bar]\n", "utf-8"
+    )
+    for words in (["check", "five-bar"], ["study", "check", str(tmp_path / "study.yaml")]):
+        assert main(words) == 1
+        assert capsys.readouterr().err.startswith("loopcal: The engine 'nativ' is not installed")
 
 
 def test_version_states_the_engine(environment, capsys):

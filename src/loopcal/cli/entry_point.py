@@ -30,7 +30,7 @@ import loopcal
 from loopcal.cli import terminal
 from loopcal.cli.hints import find_hint, word_hint
 from loopcal.environment import pin_settings
-from loopcal.errors import FileError, LoopcalError, suggest_names
+from loopcal.errors import FileError, LoopcalError, MissingPackageError, suggest_names
 from loopcal.findings import Finding
 from loopcal.output_record import record_outputs
 
@@ -244,7 +244,7 @@ def _report(
             finding = error.args[0] if error.args else None
             sentence, hint = str(error), find_hint(error.code, command)
             hint = word_hint(finding, hint) if isinstance(finding, Finding) else hint
-            if not isinstance(error, FileError):  # which names its file
+            if not isinstance(error, FileError | MissingPackageError):  # which name the reason
                 sentence = _name_inputs(sentence, hint, command, words)
         case KeyboardInterrupt() | click.exceptions.Abort():
             sentence = f"stopped before the end{unwritten}."

@@ -149,7 +149,7 @@ def force(what: str, more: str = "") -> Any:
 
 def seed(what: str, of: str) -> Any:
     """Declare the option for the seed of something random, which a function `of` makes."""
-    return option(f"Seed of {what}.", of=of, type=click.IntRange(min=0), metavar="N")
+    return option(f"Seed of {what}.", of=of, type=Whole(min=0), metavar="N")
 
 
 # Types of values
@@ -227,21 +227,30 @@ POSE_SHARE = Parsed("share", _parse_pose_share)
 
 
 class NumberRange(click.FloatRange):
-    """A number within a range, which NaN is not."""
+    """A finite number within a range."""
+
+    name = "number"
 
     def convert(self, value: Any, param: Any, ctx: Any) -> Any:
-        """Return the number."""
+        """Return the number, or fail with what is allowed."""
         number = super().convert(value, param, ctx)
-        if math.isnan(number):
-            self.fail(f"{number} is not in the range {self._describe_range()}.", param, ctx)
+        if not math.isfinite(number):
+            self.fail(f"{value!r} is not a finite number.", param, ctx)
         return number
 
 
+POSITIVE = NumberRange(0, min_open=True)
 SHARE, OPEN_SHARE = (NumberRange(0, 1, is_open, is_open) for is_open in (False, True))
 SHARE.name = OPEN_SHARE.name = "share"
 
 
-class Count(click.IntRange):
+class Whole(click.IntRange):
+    """A whole number within a range."""
+
+    name = "integer"
+
+
+class Count(Whole):
     """A whole number on the command line, up to a limit of `loopcal.io.core.limits`, which is given
     by its name, so that it is only imported when the option is used; without `least`, the command
     itself refuses small ones.
@@ -616,7 +625,7 @@ FIT: Any = Group(
     ),
     keep=option(
         "For truncated-svd: number of directions. Default: by cross-validation.",
-        type=click.IntRange(min=0),
+        type=Whole(min=0),
         metavar="K",
     ),
     noise=option(
@@ -718,7 +727,7 @@ DRAW: Any = option(
 EPSILON: Any = option(
     "End the steps when the largest error of a pose, max dQint = position error [mm] + angle "
     "[rad], is at most this number.",
-    type=NumberRange(0, math.inf, min_open=True, max_open=True),
+    type=POSITIVE,
     metavar="NUMBER",
 )
 
@@ -892,7 +901,7 @@ CONSTRAINTS: Any = Group(
     min_margin=option(
         "Smallest distance from a singularity, as a share of the median of the workspace.",
         of="loopcal.planning.constraints:Constraints",
-        type=float,
+        type=SHARE,
     ),
     stroke_margin=option(
         "Distance of all readings from both ends of their strokes, such as 5mm, or 2deg for "

@@ -450,10 +450,11 @@ def _descend_from_chords(
     kinds = problem.residuals(z, shared.solution)
     residual = np.concatenate([kind.whitened.reshape(t, -1) for kind in kinds], axis=1)
     # one product for each trial: a product of all of them would round by their number
-    step = np.matmul(shared.by_residuals, residual[:, :, None])
-    step = -(step + np.matmul(shared.by_deviation, z[:, :, None]))[:, :, 0]
-    # by how much a chord changes the whitened residuals, to first order
-    length = np.linalg.norm(np.matmul(shared.triangle, step[:, :, None])[:, :, 0], axis=1)
+    with np.errstate(over="ignore", invalid="ignore"):  # of residuals that are huge or infinite
+        step = np.matmul(shared.by_residuals, residual[:, :, None])
+        step = -(step + np.matmul(shared.by_deviation, z[:, :, None]))[:, :, 0]
+        # by how much a chord changes the whitened residuals, to first order
+        length = np.linalg.norm(np.matmul(shared.triangle, step[:, :, None])[:, :, 0], axis=1)
     good = np.isfinite(length)
     fit = descend(
         problem,

@@ -31,7 +31,8 @@ from loopcal.environment import import_optional
 from loopcal.errors import DataError, StudyError
 from loopcal.findings import report_finding
 from loopcal.findings.catalog import find_entry
-from loopcal.io.core.text_file import replace_file, to_json, write_bytes, write_text
+from loopcal.io.core.outputs import refuse_outputs, write_files
+from loopcal.io.core.text_file import replace_file, to_json
 from loopcal.report.words import say
 from loopcal.results.description import Records, Variable
 from loopcal.results.presenters import register
@@ -821,12 +822,13 @@ def write_summary(
     figures: Mapping[str, bytes],
 ) -> None:
     """Write summary.json, with the answered questions, summary.csv, and figures (name -> content)
-    into the folder of a study.
+    into the folder of a study, or none of them.
     """
-    write_text(folder / JSON, to_json(build_document(summary, answered)))
-    write_text(folder / CSV, tabulate_all(study, summary).to_csv())
-    for name, content in figures.items():
-        write_bytes(folder / name, content)
+    texts = {JSON: to_json(build_document(summary, answered))}
+    texts[CSV] = tabulate_all(study, summary).to_csv()
+    files = {folder / name: content for name, content in {**texts, **figures}.items()}
+    refuse_outputs(tuple(files), (), force=True)
+    write_files(files)
 
 
 def tabulate_medians(study: Study, summary: StudySummary, names: Sequence[str]) -> Table:

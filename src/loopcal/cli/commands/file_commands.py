@@ -268,12 +268,12 @@ def gcode(
     plan: Path = opt.argument("PLAN", type=opt.FILE),
     feed: float | None = opt.option(
         "Feed per minute, in the unit of the program.  [default: 300 mm, in inches as fast]",
-        type=float,
+        type=opt.POSITIVE,
         metavar="NUMBER",
     ),
     pause: float | None = opt.option(
         "Time to wait at each pose (G4).  [default: stop until the operator continues, M0]",
-        type=float,
+        type=opt.POSITIVE,
         metavar="SECONDS",
     ),
     unit: Literal["mm", "in"] | None = opt.option(

@@ -552,16 +552,11 @@ def photos(
     mount: str = opt.option(
         "What the platform carries.", type=click.Choice(("board", "camera")), default="board"
     ),
-    sigma: float = opt.option(
-        "Noise of u and v.",
-        type=opt.NumberRange(0.0, math.inf, min_open=True, max_open=True),
-        default=0.1,
-        metavar="PX",
-    ),
+    sigma: float = opt.option("Noise of u and v.", type=opt.POSITIVE, default=0.1, metavar="PX"),
     most_blur: float = opt.option(
         "Blur of edges above which a picture is left out.",
         of="loopcal.io.pictures:BLUR",
-        type=opt.NumberRange(0.0, math.inf, min_open=True, max_open=True),
+        type=opt.POSITIVE,
         metavar="PX",
     ),
     workers: int | None = opt.option(

@@ -65,12 +65,12 @@ def measure(
     ),
     minutes: float | None = opt.option(
         "Time to measure a pose. loopcal then shows the time left.",
-        type=opt.NumberRange(0.0, min_open=True),
+        type=opt.POSITIVE,
         metavar="MINUTES",
     ),
     speed: float | None = opt.option(
         "Speed of travel in mm per minute, with --minutes.  [default: travel takes no time]",
-        type=opt.NumberRange(0.0, min_open=True),
+        type=opt.POSITIVE,
         metavar="NUMBER",
     ),
     check_every: int = opt.option(
@@ -136,9 +136,7 @@ def app(
     host: str = opt.option(
         "Address to listen on, such as 0.0.0.0 for a tablet.", default="127.0.0.1"
     ),
-    port: int = opt.option(
-        "Port.  [default: a free one]", default=0, type=click.IntRange(0, 65535)
-    ),
+    port: int = opt.option("Port.  [default: a free one]", default=0, type=opt.Whole(0, 65535)),
     keep: Path | None = opt.path(
         "Folder that keeps the files, new or to go on with.", metavar="DIR"
     ),

@@ -414,7 +414,7 @@ def guess_frames(
     start = guess_nuisance_values(data, measured, T, nuisance, most=most, steps=steps)
     sizes = [np.zeros((h, 0))]
     for o, places in zip(data.observations, nuisance.indices, strict=True):
-        if len(o) and not o.kind.sensed_joints:
+        if h and len(o) and not o.kind.sensed_joints:
             residual = o.compute_residuals(T, start[:, places])
             whitened = np.matmul(o.whitener, residual[..., None])[..., 0]
             sizes.append(np.linalg.norm(whitened, axis=-1))

@@ -30,7 +30,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, TypeVar
 
-from loopcal.errors import DataError, FileError, LoopcalError
+from loopcal.errors import DataError, FileError, LoopcalError, MissingPackageError
 from loopcal.io.core.limits import JSON_DEPTH, JSON_VALUES, PROGRAM_SIZE, FileLimit
 from loopcal.output_record import identify, note_output, record_outputs, was_free
 from loopcal.plain_text import escape_json
@@ -492,10 +492,12 @@ def _take_new_name(temporary: Path, target: Path, path: str | Path) -> None:
 
 @contextmanager
 def name_files(*paths: str | Path) -> Iterator[None]:
-    """Put files in front of the text of an error of the body that does not name its file."""
+    """Put files in front of the text of an error of the body that does not name its file, except
+    that of a missing package or engine, for which no file is the reason.
+    """
     try:
         yield
-    except FileError:
+    except (FileError, MissingPackageError):
         raise
     except LoopcalError as error:
         raise type(error)(f"{' and '.join(map(str, paths))}: {error}") from error

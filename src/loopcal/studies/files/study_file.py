@@ -9,7 +9,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from loopcal.errors import DataError, LoopcalError
+from loopcal.errors import DataError, LoopcalError, MissingPackageError
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.penalties import Ridge
 from loopcal.io.core import yaml_file
@@ -195,6 +195,8 @@ def read_robots(content: StudyContent) -> dict[str, tuple[Robot, Mechanism]]:
                 value
             )
             robot = robot_file.load_robot(path)
+        except MissingPackageError:
+            raise
         except LoopcalError as error:
             raise file.error(f"cannot read the robot {name!r}: {error}", place) from None
         robots[name] = (Robot(value, robot_file.get_source(robot).file.text), robot)
