@@ -255,18 +255,12 @@ def write(source: ExportSource, into: Path | None) -> Exported:
             shown = source.round_number(zero / factor, name, factor, DECIMALS)
             code, length = "files.joint-position", f"{format_short(shown, DECIMALS)} {unit.symbol}"
             findings.append(report_finding(code, joint=n, length=length, component=kins.name))
-    rest = {name: value for name, value in _get_nominal(source).items() if name not in zeros}
-    own = source.values()
-    lost = [name for name, value in {**rest, **held}.items() if abs(own[name] - value) > ROUNDING]
+    stored = {**ExportSource(source.robot.nominal).values(), **held}
+    others = ((n, v) for n, v in source.values().items() if n not in zeros)
+    lost = [name for name, value in others if abs(value - stored[name]) > ROUNDING]
     if lost:
         findings.append(report_finding("files.not-expressed", format=kins.name, names=tuple(lost)))
     return hal.export(into, wanted, dict.fromkeys(wanted, 0.0), findings)
-
-
-def _get_nominal(source: ExportSource) -> dict[str, float]:
-    """Return parameter -> nominal value [SI]."""
-    table = source.robot.parameters
-    return dict(zip(table.names, table.nominal.tolist(), strict=True))
 
 
 def _find_component(source: ExportSource, format_name: str) -> tuple[RobotRecord, Component]:
@@ -320,7 +314,8 @@ class IniFile(ValueFile):
 def write_ini(source: ExportSource, into: Path | None) -> Exported:
     """Return an INI file with corrected offsets, or entries; for people what to add to each."""
     _, kins = _find_component(source, INI_FORMAT.name)
-    zeros, nominal = (kins.hold(values)[1] for values in (source.values(), _get_nominal(source)))
+    before = ExportSource(source.robot.nominal)
+    zeros, nominal = (kins.hold(of.values())[1] for of in (source, before))
     joints = {f"JOINT_{n}": name for n, name in enumerate(zeros)}
     unit = source.robot.units[Dimension.LENGTH]
     ini = None if into is None else IniFile.load(into)
