@@ -278,6 +278,47 @@ def test_arms_that_do_not_reach_are_refused_with_their_line(tmp_path) -> None:
         FORMATS["klipper"].write(ExportSource(robot.with_values(short)), None)  # type: ignore[misc]
 
 
+POLAR = (
+    "[printer]\nkinematics: polar\nmax_velocity: 300\n[stepper_bed]\ngear_ratio: 80:16\n"
+    + PINS.format(0)
+    + "[stepper_arm]\nrotation_distance: {0}\nposition_endstop: {1}\nposition_max: 170\n"
+    + PINS.format(1)
+    + "[stepper_z]\nrotation_distance: 8\nposition_endstop: 0.5\nposition_max: 200\n"
+    + PINS.format(2)
+)
+
+
+@pytest.mark.slow
+def test_klipper_moves_a_polar_printer_as_the_page_states(klipper, tmp_path, root) -> None:
+    page = (root / "docs" / "controllers.md").read_text("utf-8")
+    text = re.search(r"<!-- file: polar.yaml -->\n```yaml\n(.*?)```", page, re.DOTALL)
+    assert text is not None
+    (tmp_path / "polar.yaml").write_text(text[1])
+    robot = lc.load_robot(tmp_path / "polar.yaml")
+    identified = robot.with_values(
+        robot.values + np.where([n == "arm.y" for n in robot.parameters.names], 0.0, 3e-4)
+    )
+    values = dict(zip(robot.parameters.names, identified.values / MM, strict=True))
+    (tmp_path / "printer.cfg").write_text(
+        POLAR.replace("{0}", f"{values['arm.arm.lead']:.9f}").replace(
+            "{1}", f"{values['arm.arm.offset']:.9f}"
+        )
+    )
+    kinematics = Printer(tmp_path / "printer.cfg").load_kinematics("polar")
+    rng = np.random.default_rng(9)
+    bed, steps = rng.uniform(-3, 3, 20), rng.integers(-9000, -1000, 20)
+    arm = kinematics.rails[0].get_steppers()[0]
+    at_stop, step = kinematics.rails[0].get_homing_info().position_endstop, arm.get_step_dist()
+    names = [stepper.get_name() for stepper in kinematics.get_steppers()]
+    own = [
+        kinematics.calc_position(dict(zip(names, (b, at_stop + k * step, 1.0), strict=True)))
+        for b, k in zip(bed.tolist(), steps.tolist(), strict=True)
+    ]
+    turns = 2 * math.pi * steps / 3200  # of the pulley, from the end stop
+    places = lc.forward(identified, np.column_stack([bed, turns, np.full(20, MM)])).T
+    np.testing.assert_allclose(places[:, :3, 3] / MM, own, rtol=0, atol=1e-6)
+
+
 def intersect(centers: np.ndarray, lengths: np.ndarray) -> np.ndarray:
     """Return the lower intersection of three spheres, by the plane that two differences span."""
     A = 2 * (centers[1:] - centers[0])
