@@ -234,22 +234,24 @@ def test_path_that_leaves_the_strokes_is_refused_with_the_reason(hexapod):
     assert not inside.all()
 
 
-@pytest.mark.parametrize("name", ["hexapod-42", "cable-camera", "pulley-3"])
-def test_paths_checked_at_once_are_those_checked_step_by_step(monkeypatch, name):
+@pytest.mark.parametrize("name", ["hexapod-42", "excavator", "pulley-3", "3-rrr", "six-bar"])
+def test_allowed_paths_are_those_that_a_machine_follows_step_by_step(name):
     robot = load_robot(name)
     ranges = np.array([workspace_ranges(robot)[name] for name in robot.controlled])
     middle, half = ranges.mean(axis=1), np.diff(ranges)[:, 0]
-    rng = np.random.default_rng(4)
-    ends = middle + 1.5 * half * rng.uniform(-1.0, 1.0, (2, 80, len(middle)))
+    ends = middle + 1.5 * half * np.random.default_rng(4).uniform(-1.0, 1.0, (2, 40, len(middle)))
     # without strokes, so that paths end near singularities and in other modes
     free = tuple(replace(actuator, stroke=None) for actuator in robot.actuators)
     robot = replace(robot, assembly=replace(robot.assembly, actuators=free))
     checker = build_checker(robot, Constraints(min_margin=0.4))
-    at_once = check_paths(checker, *ends).violations.tolist()
-    monkeypatch.setattr(path, "has_one_solution", lambda robot: False)
-    assert at_once == check_paths(checker, *ends).violations.tolist()
-    codes = {None if why is None else why.code for why in at_once}
-    assert codes == {None, "near-singularity", "other-mode"}
+    allowed = check_paths(checker, *ends).allowed
+    begin, end = (np.array(places)[allowed] for places in ends)
+    present = inverse(robot, begin)
+    for share in np.linspace(0.0, 1.0, 60):
+        present = inverse(robot, interpolate_path(robot, begin, end, share), present)
+        assert checker.check_poses(present, at_pose=False).allowed.all()
+    np.testing.assert_allclose(present.q, inverse(robot, end).q, atol=1e-6)
+    assert 0 < allowed.sum() < len(allowed)
 
 
 def test_path_through_a_singularity_is_refused():

@@ -155,8 +155,7 @@ def differentiate_at_pose(
     unknown[:, :, :m, p:] = np.eye(m)
     for rows, blocks in linearize_limbs(robot, values, state):
         both = stack_sum_rows(program, blocks, select_block(weights, rows)[:, 0, a:])
-        _, E, _ = stack_limb_rows(program, blocks)
-        opened = np.matmul(E, select_block(displacements, rows[:1])[:, None])
+        _, opened, _ = stack_limb_rows(program, blocks, select_block(displacements, rows[:1]))
         right = np.concatenate([np.zeros((*both.shape[:3], p)), both[..., :m]], axis=3)
         right[:, :, : opened.shape[2], :p] = opened
         right[:, :, opened.shape[2] :, :p] = -select_block(moved.parameters, rows)[:, :, a:]
@@ -269,8 +268,7 @@ def differentiate_open_sums(
         lengths = driven_values(program, block)
         weights, moved = _differentiate_sums(robot, own, readings, lengths)
         inverse = invert_sum_rows(robot, blocks, weights[:, 0])
-        _, E, _ = stack_limb_rows(program, blocks)
-        opened = np.matmul(E, select_block(displacements, rows[:1])[:, None])
+        _, opened, _ = stack_limb_rows(program, blocks, select_block(displacements, rows[:1]))
         c = opened.shape[2]
         out[rows] = np.matmul(inverse[..., c:], np.concatenate(moved, axis=3))
         out[rows][..., :p] -= np.matmul(inverse[..., :c], opened)

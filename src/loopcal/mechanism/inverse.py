@@ -10,6 +10,7 @@ docs/theory/kinematics.md.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from itertools import islice
 from typing import Any, ClassVar
 
 import numpy as np
@@ -153,6 +154,7 @@ In ten steps the longest ones turn a joint by 5 rad. Steps close to a stretched 
 SHORT_SHARE = 1e-8
 # Relative singular value below which a combination of drives does not move the platform.
 DEPENDENT = 1e-9
+WEAK = 1e10  # condition of S S' above which the step is not S'(S S')^-1 r, but by singular values
 PATH_STEPS = 8  # steps of the path from the start's pose to a target
 
 
@@ -188,7 +190,8 @@ class _Rows:
     values : (1 | R, p). target : (R, c) controlled coordinates. e, sums, drives, fronts : of each
         stage displacements or `Placed` links without loops, open sums, transmissions, and the frame
         before its first joint, of loops their base, in the platform that carries it, (1 | R, ..).
-    behind, advance : (1 | R, u, ..) links behind the joints of serial stages, and their advances.
+    serial : (s,) places of the joints of serial stages. behind, advance : (1 | R, s, ..) links
+        behind these joints, and their advances.
     sign : (R,) of det(C D) at the start. moving : drives that carry the end platform.
     turns : (u,) whether each drive turns joints, so that its unit counts for the robot's size.
     spans : (u,) strokes of the drives, of which steps take equal shares with more drives than
@@ -197,7 +200,7 @@ class _Rows:
     known : the iterate of home, once it is known.
     """
 
-    shared: ClassVar[tuple[str, ...]] = ("robot", "turns", "spans", "moving", "known")
+    shared: ClassVar[tuple[str, ...]] = ("robot", "serial", "turns", "spans", "moving", "known")
 
     robot: Mechanism
     values: FloatArray
@@ -206,6 +209,7 @@ class _Rows:
     sums: tuple[OpenSums | None, ...]
     drives: tuple[Transmissions, ...]
     fronts: tuple[FloatArray, ...]
+    serial: IntArray
     behind: FloatArray
     advance: FloatArray
     sign: FloatArray
@@ -230,16 +234,18 @@ class _Rows:
         ok, loops, states = np.isfinite(u).all(axis=1), iter(begin), list[State]()
         T, platforms, moved = np.eye(4), {-1: np.eye(4)}, list[tuple[Any, ...]]()
         with np.errstate(invalid="ignore"):
-            steps = move_joints(self.turns, u, self.advance) @ self.behind
+            turned = self.turns[self.serial]
+            steps = move_joints(turned, u[:, self.serial], self.advance) @ self.behind
+            joints = zip(self.serial[:, None], self.advance.T, steps.swapaxes(0, 1), strict=True)
             for i, (stage, sums) in enumerate(zip(self.robot.blocks, self.sums, strict=True)):
                 robot, first = stage.robot, stage.actuators.start
                 T = platforms[stage.parent] @ self.fronts[i]
                 if robot.is_serial:
-                    for j in first + robot.program.groups[0].actuator[:-1]:
+                    for j, advance, step in islice(joints, robot.program.n_joints):
                         axis = T[..., :3, 2:3]
-                        by_joint = axis * self.turns[j], axis * self.advance[:, j, None]
+                        by_joint = axis * self.turns[j], axis * advance[:, None, None]
                         moved.append((i, j, *by_joint, T))
-                        T = T @ steps[:, j[0]]
+                        T = T @ step
                 else:
                     own, weights, by_sums = _select_drives(stage, u), None, None
                     if sums is not None:
@@ -397,12 +403,16 @@ class _Rows:
 
 def _invert_slopes(slope: FloatArray) -> FloatArray:
     """Return pseudo-inverses (R, u, c) of slopes (R, c, u), without dependent combinations."""
-    if slope.shape[1] <= slope.shape[2]:
-        orthogonal, triangle = np.linalg.qr(slope.swapaxes(1, 2))
-        pivots = np.abs(np.einsum("...ii->...i", triangle))  # up to 2^c singular values
-        if (pivots.min(axis=1) > 2.0 ** slope.shape[1] * DEPENDENT * pivots.max(axis=1)).all():
-            return np.matmul(orthogonal, np.linalg.inv(triangle).swapaxes(1, 2))
-    return np.asarray(np.linalg.pinv(slope, rcond=DEPENDENT), np.float64)
+    if slope.shape[1] > slope.shape[2]:
+        return np.asarray(np.linalg.pinv(slope, rcond=DEPENDENT), np.float64)
+    transposed = slope.swapaxes(1, 2)
+    square = slope @ transposed
+    unknown = invert_weights(square)
+    inverse = transposed @ unknown
+    growth = np.linalg.norm(square, axis=(1, 2)) * np.linalg.norm(unknown, axis=(1, 2))
+    if (weak := ~(growth < WEAK)).any():
+        inverse[weak] = np.linalg.pinv(slope[weak], rcond=DEPENDENT)
+    return inverse
 
 
 def _select_drives(stage: Stage, u: FloatArray) -> FloatArray:
@@ -462,8 +472,8 @@ def _make_rows(robot: Mechanism, values: FloatArray, target: FloatArray) -> _Row
 def _place_rows(robot: Mechanism, values: FloatArray) -> _Rows:
     """Return rows with values (1 | R, p), without targets."""
     robot, parts, turns = robot.exact, list[tuple[Any, ...]](), list[bool]()
-    behind = np.tile(np.eye(4), (len(values), len(robot.actuators), 1, 1))
-    advance = np.zeros(behind.shape[:2])
+    serial, behind = [np.zeros(0, np.int64)], [np.zeros((len(values), 0, 4, 4))]
+    advance = [np.zeros((len(values), 0))]
     for stage in robot.blocks:
         own, assembly = values[:, stage.parameters], stage.robot.assembly
         (e, drives), front = stage.robot.slots(own), stage.mount[None]
@@ -472,11 +482,10 @@ def _place_rows(robot: Mechanism, values: FloatArray) -> _Rows:
         if stage.robot.is_serial:
             (group,) = stage.robot.program.groups
             links, advances = e = place_serial(group, e)
-            front, columns = (
-                stage.mount @ links[:, 0],
-                stage.actuators.start + group.actuator[:-1, 0],
-            )
-            behind[:, columns], advance[:, columns] = links[:, 1:], advances
+            front = stage.mount @ links[:, 0]
+            serial.append(stage.actuators.start + group.actuator[:-1, 0])
+            behind.append(links[:, 1:])
+            advance.append(advances)
         sums = list_open_sums(stage.robot, own, chosen) if has_sums else None
         parts.append((e, sums, drives, front))
         moved = [(name,) for name in assembly.driven_joints]
@@ -486,8 +495,9 @@ def _place_rows(robot: Mechanism, values: FloatArray) -> _Rows:
         turns += [not assembly.turning_drives.isdisjoint(names) for names in moved]
     (e, sums, drives, fronts), turning = zip(*parts, strict=True), np.array(turns)
     spans, moving = measure_spans(robot, turning), chains.find_carrying_actuators(robot)
-    fixed = e, sums, drives, fronts, behind, advance, np.zeros(0), turning, spans, moving
-    return _Rows(robot, values, np.zeros((0, 0)), *fixed)
+    links, advances = (np.concatenate(own, axis=1) for own in (behind, advance))
+    fixed = e, sums, drives, fronts, np.concatenate(serial), links, advances
+    return _Rows(robot, values, np.zeros((0, 0)), *fixed, np.zeros(0), turning, spans, moving)
 
 
 def measure_spans(robot: Mechanism, turns: BoolArray) -> FloatArray:

@@ -89,7 +89,7 @@ def linearize_limbs(
     poses = max(min(n, BLOCK_ROWS), 1)
     trials = max(1, BLOCK_ROWS // poses)
     for i in range(0, t, trials):
-        for j in range(0, n, poses):
+        for j in range(0, max(n, 1), poses):
             rows = slice(i, min(i + trials, t)), slice(j, min(j + poses, n))
             part = map_arrays(lambda a, rows=rows: a[rows], state)
             joints = driven_values(robot.program, part)
@@ -144,21 +144,25 @@ def move_passive_joints(
 
 
 def stack_limb_rows(
-    program: Program, blocks: engine.ClosureBlocks, *, passive: bool = False
+    program: Program,
+    blocks: engine.ClosureBlocks,
+    inputs: FloatArray | None = None,
+    *,
+    passive: bool = False,
 ) -> tuple[FloatArray, FloatArray, IntArray]:
     """Return all closure rows, or those of passive joints, limb by limb: against the freedoms of
-    all nodes, then the driven joints (t, n, c, M + J), and against displacements (t, n, c, d); and
-    the limb of each row (c,).
+    all nodes, then the driven joints (t, n, c, M + J), and against inputs (t, n, c, w), by which
+    the displacements have the derivatives (t | 1, d, w), none by default; and the limb of each row.
     """
     M, limbs = len(program.unknown_twists), [*divide_limbs(program, blocks, passive=passive)]
     counts = [own.A.shape[2] for own in limbs]
-    shape = *limbs[0].A.shape[:2], sum(counts)
-    rows, E = np.zeros((*shape, M + program.n_joints)), np.zeros((*shape, program.n_displacements))
+    rows = np.zeros((*limbs[0].A.shape[:2], sum(counts), M + program.n_joints))
+    moved = np.zeros((1, program.n_displacements, 0)) if inputs is None else inputs
     for own, last in zip(limbs, np.cumsum(counts), strict=True):
         part = slice(last - own.A.shape[2], last)
         rows[:, :, part, :M], rows[:, :, part, M + own.drives] = own.A, own.Q
-        E[:, :, part, own.slots] = own.E
-    return rows, E, np.repeat([own.limb for own in limbs], counts)
+    opened = [np.matmul(own.E, moved[:, None, own.slots]) for own in limbs]
+    return rows, np.concatenate(opened, axis=2), np.repeat([own.limb for own in limbs], counts)
 
 
 def stack_scaled_rows(robot: Mechanism, blocks: engine.ClosureBlocks) -> FloatArray:
@@ -175,16 +179,13 @@ def reduce_to_platform(
     """Return the closure rows that contain no twist of other nodes than the platform, against its
     freedoms (t, n, c, m) and the actuated joints (t, n, c, a), by an orthogonal reduction.
     """
-    (rows, *_), m, M = (
-        stack_limb_rows(program, blocks),
-        len(program.freedoms),
-        len(program.unknown_twists),
-    )
-    if eliminated := M - m:
+    rows, *_ = stack_limb_rows(program, blocks)
+    m, M, c = len(program.freedoms), len(program.unknown_twists), rows.shape[2]
+    if m < M:
         whole = np.concatenate([rows[..., m:M], rows[..., :m], rows[..., M:]], axis=-1)
-        short = np.asarray(np.linalg.qr(whole, mode="r"))[..., eliminated:, eliminated:]
-        rows = np.zeros((*rows.shape[:2], rows.shape[2] - eliminated, short.shape[-1]))
-        rows[:, :, : short.shape[2]] = short
+        none = np.zeros((*whole.shape[:2], whole.shape[3], whole.shape[3]))
+        folded = engine.fold(*(a.reshape(-1, *a.shape[2:]) for a in (none, whole)))
+        rows = folded.reshape(none.shape)[:, :, M - m : c, M - m :]
     return rows[..., :m], rows[..., m:]
 
 

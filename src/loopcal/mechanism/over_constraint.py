@@ -23,7 +23,12 @@ from loopcal.errors import MechanismError
 from loopcal.findings import Finding, report_finding
 from loopcal.mechanism.assembly import AXES, Assembly
 from loopcal.mechanism.kinematics import compute_readings, forward_trials
-from loopcal.mechanism.limb_rows import linearize_state, stack_limb_rows, stack_scaled_rows
+from loopcal.mechanism.limb_rows import (
+    differentiate_displacements,
+    linearize_state,
+    stack_limb_rows,
+    stack_scaled_rows,
+)
 from loopcal.mechanism.mobility import RANK, check_assembly
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.states import Status, join_states, select_poses
@@ -48,8 +53,8 @@ class _Rows(NamedTuple):
     """The closure equations at one pose with the passive joints eliminated.
 
     A : (c, M) by the freedoms of all nodes, rotations over the robot's size. both : (c, M + J) by
-    these, then driven joints. E : (c, d) by displacements. limb : (c,) the limb of each equation.
-    absorbed : (j, d) by displacements, the equations that determine the j passive joints.
+    these, then driven joints. E : (c, p) by parameters. limb : (c,) the limb of each equation.
+    absorbed : (j, p) by parameters, the equations that determine the j passive joints.
     """
 
     A: FloatArray
@@ -83,10 +88,14 @@ def _find_basis(vectors: FloatArray) -> FloatArray:
 
 def _linearize(robot: Mechanism, state: State) -> list[_Rows]:
     """Return the equations at the poses of a state (1, n), at the nominal values."""
-    program, blocks = robot.program, linearize_state(robot, state, robot.parameters.nominal[None])
+    program, nominal = robot.program, robot.parameters.nominal[None]
+    blocks, slopes = (
+        linearize_state(robot, state, nominal),
+        differentiate_displacements(robot, nominal),
+    )
     both, M = stack_scaled_rows(robot, blocks)[0], len(program.unknown_twists)
-    _, (E,), limb = stack_limb_rows(program, blocks)
-    _, (absorbed,), _ = stack_limb_rows(program, blocks, passive=True)
+    _, (E,), limb = stack_limb_rows(program, blocks, slopes)
+    _, (absorbed,), _ = stack_limb_rows(program, blocks, slopes, passive=True)
     return [_Rows(own[:, :M], own, E[i], limb, absorbed[i]) for i, own in enumerate(both)]
 
 
@@ -302,10 +311,8 @@ def _detect_breaking(robot: Mechanism) -> BoolArray:
         breaks[stage.parameters] = _detect_breaking(stage.robot)
     if robot.stages or robot.program.may_stay_open or not is_over_constrained(robot):
         return breaks
-    d = robot.program.n_displacements
-    slopes = robot.slots.jacobian(robot.parameters.nominal[None])[0, :d]
     for rows in _linearize(robot, find_nearby_states(robot)):
-        opened = np.linalg.norm(rows.find_repeated() @ rows.E @ slopes, axis=0)
-        effect = np.linalg.norm(np.concatenate([rows.E, rows.absorbed]) @ slopes, axis=0)
+        opened = np.linalg.norm(rows.find_repeated() @ rows.E, axis=0)
+        effect = np.linalg.norm(np.concatenate([rows.E, rows.absorbed]), axis=0)
         breaks |= opened > BREAKS * effect
     return breaks

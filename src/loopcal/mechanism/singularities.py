@@ -25,11 +25,16 @@ from loopcal.errors import DataError
 from loopcal.findings import Finding, report_finding
 from loopcal.mechanism.actuation import differentiate_unknowns_by_sums
 from loopcal.mechanism.assembly import AXES
-from loopcal.mechanism.chains import find_carrying_actuators, split_stage_states, transport_to_end
+from loopcal.mechanism.chains import (
+    find_carrying_actuators,
+    list_carrying_stages,
+    split_stage_states,
+    transport_to_end,
+)
 from loopcal.mechanism.kinematics import compute_closure_sign, compute_readings
-from loopcal.mechanism.limb_rows import linearize_state, reduce_to_platform
+from loopcal.mechanism.limb_rows import linearize_limbs, reduce_to_platform
 from loopcal.mechanism.mobility import list_main_freedoms
-from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.model import Mechanism, ParameterUnits
 from loopcal.mechanism.platform_coordinates import differentiate_coordinates
 from loopcal.mechanism.sensitivity import differentiate_pose
 from loopcal.mechanism.solutions import Solution, forward, inverse, make_solution
@@ -214,12 +219,10 @@ def find_near_singularity(
     up to its first row that is near. A singular value changes at most as much as its matrix (Weyl),
     so that most rows of a path need no decomposition.
     """
-    if robot.stages:
-        margin, _, drive_margin, _ = _compute_chain_margins(robot, state)
-        return ~((margin >= least[0]) & (drive_margin >= least[1]) & asked)
-    *matrices, good = _scale_closure(robot, state)
-    is_near = ~(good & asked).reshape(-1, steps)
-    for matrix, bound in zip(matrices, least, strict=True):
+    loops, drives, _ = _list_matrices(robot, state)
+    is_near = ~asked.reshape(-1, steps)
+    for (matrix, good), bound in (*((own, least[0]) for own in loops.values()), (drives, least[1])):
+        is_near |= ~good.reshape(is_near.shape)
         paths = matrix.reshape(-1, steps, matrix.shape[1] * matrix.shape[2])
         left, row = np.flatnonzero(~is_near[:, 0]), np.int64(0)
         while len(left):
@@ -256,21 +259,62 @@ def _compute_margins(
 
     The state is (1, n).
     """
-    if robot.stages:
-        return _compute_chain_margins(robot, state)
-    A, Q, good = _scale_closure(robot, state)
-    _, s, V = np.linalg.svd(A)
-    _, r, W = np.linalg.svd(Q)
-    margin, drive_margin = (np.where(good, x[:, -1], np.nan) for x in (s, r))
-    return margin, V[:, s.shape[1] - 1], drive_margin, np.abs(W[:, -1]).argmax(axis=1)
+    loops, (slope, good), moving = _list_matrices(robot, state)
+    chain, n = robot.stages, state.T.shape[1]
+    transports = dict(transport_to_end(robot, state, -1)) if chain else {0: np.eye(6)}
+    margin, direction = np.full(n, 1.0 if chain else np.inf), np.tile(np.eye(6)[0], (n, 1))
+    for i, (A, is_known) in loops.items():
+        block = robot.blocks[i].robot
+        _, s, V = np.linalg.svd(A)
+        least, twist, freedoms = s[:, -1], np.zeros((n, 6)), list(block.program.freedoms)
+        twist[:, freedoms] = V[:, s.shape[1] - 1] / block.twist_scale[freedoms]
+        twist = np.matmul(transports[i], twist[..., None])[..., 0] * robot.twist_scale
+        length = np.linalg.norm(twist, axis=1, keepdims=True)
+        is_less = ~(margin <= np.where(is_known, least, np.nan))
+        margin = np.where(is_less, np.where(is_known, least, np.nan), margin)
+        direction = np.where(is_less[:, None], twist / np.maximum(length, 1e-300), direction)
+    _, r, W = np.linalg.svd(slope)
+    weakest = moving[np.abs(W[:, r.shape[1] - 1]).argmax(axis=1)]
+    direction = direction[:, list(robot.program.freedoms)]
+    return margin, direction, np.where(good, r[:, -1], np.nan), weakest
+
+
+Matrix = tuple[FloatArray, BoolArray]
+"""A matrix (n, .., ..) whose smallest singular value is a margin, and where it is finite (n,); it
+is zero elsewhere."""
+
+
+def _list_matrices(robot: Mechanism, state: State) -> tuple[dict[int, Matrix], Matrix, IntArray]:
+    """Return A of the blocks with loops that carry the platform, by number; Q, or of a chain the
+    derivatives C D of the controlled coordinates by readings; and the places of its drives.
+    """
+    if not robot.stages:
+        A, Q, good = _scale_closure(robot, state)
+        return {0: (A, good)}, (Q, good), np.arange(Q.shape[2])
+    own, loops, values = split_stage_states(robot, state), dict[int, Matrix](), robot.values[None]
+    for i in list_carrying_stages(robot):
+        if not (stage := robot.present_stages[i]).is_serial:
+            A, _, good = _scale_closure(stage, own[i])
+            loops[i] = A, good
+    q = compute_readings(robot, values, state)
+    none = ParameterUnits(robot.slots, np.zeros(0, np.int64), np.zeros(0))
+    D = differentiate_pose(robot, values, q, state, none).readings[0]
+    columns = differentiate_coordinates(state.T[0], robot.controlled, robot.size)
+    moving, (_, drives) = find_carrying_actuators(robot), robot.present
+    turned = np.abs(drives.differentiate_by_readings(q)[0]).sum(axis=1)
+    units = robot.drive_units * np.where(turned, turned, 1.0)  # of a reading
+    slope = np.matmul(columns, D[..., moving]) / units[:, None, moving]
+    good = np.isfinite(slope).all(axis=(1, 2))
+    return loops, (np.where(good[:, None, None], slope, 0.0), good), moving
 
 
 def _scale_closure(robot: Mechanism, state: State) -> tuple[FloatArray, FloatArray, BoolArray]:
     """Return A (n, c, m) and Q (n, c, a) in meters at a state (1, n) of a machine without stages,
     zero where a number is not finite, and where all are finite (n,).
     """
-    program, blocks = robot.program, linearize_state(robot, state)
-    A, Q = (rows[0] for rows in reduce_to_platform(program, blocks))
+    program, limbs = robot.program, linearize_limbs(robot, robot.values[None], state)
+    parts = [reduce_to_platform(program, blocks) for _, blocks in limbs]
+    A, Q = (np.concatenate(rows, axis=1)[0] for rows in zip(*parts, strict=True))
     if robot.has_sums:
         e, drives = robot.present
         weights, chosen = drives.weights, ~drives.fixed_rows  # sums of commanded readings
@@ -286,39 +330,3 @@ def _scale_closure(robot: Mechanism, state: State) -> tuple[FloatArray, FloatArr
     Q = Q / robot.drive_units[: Q.shape[2]]
     good = np.asarray(np.isfinite(A).all(axis=(1, 2)) & np.isfinite(Q).all(axis=(1, 2)))
     return np.where(good[:, None, None], A, 0.0), np.where(good[:, None, None], Q, 0.0), good
-
-
-def _compute_chain_margins(
-    robot: Mechanism, state: State
-) -> tuple[FloatArray, FloatArray, FloatArray, IntArray]:
-    """Return the least margin of the loops of a chain, 1 without loops, and that of the derivatives
-    C D of the controlled coordinates by the readings.
-    """
-    n, values = state.T.shape[1], robot.values[None]
-    margin, direction = np.ones(n), np.tile(np.eye(6)[0], (n, 1))
-    transports = dict(transport_to_end(robot, state, len(robot.stages) - 1))
-    for i, own in enumerate(split_stage_states(robot, state)):
-        stage = robot.stages[i].robot
-        if stage.is_serial or i not in transports:
-            continue
-        least, motion, *_ = _compute_margins(stage, own)
-        twist = np.zeros((n, 6))
-        freedoms = list(stage.program.freedoms)
-        twist[:, freedoms] = motion / stage.twist_scale[freedoms]
-        twist = np.matmul(transports[i][0], twist[..., None])[..., 0] * robot.twist_scale
-        length = np.linalg.norm(twist, axis=1, keepdims=True)
-        is_less = ~(margin <= least)
-        margin = np.where(is_less, least, margin)
-        direction = np.where(is_less[:, None], twist / np.maximum(length, 1e-300), direction)
-    q = compute_readings(robot, values, state)
-    D = differentiate_pose(robot, values, q, state).readings[0]
-    columns = differentiate_coordinates(state.T[0], robot.controlled, robot.size)
-    moving = find_carrying_actuators(robot)
-    _, drives = robot.slots(values)
-    turned = np.abs(drives.differentiate_by_readings(q)[0]).sum(axis=1)
-    units = robot.drive_units * np.where(turned, turned, 1.0)  # of a reading
-    slope = np.matmul(columns, D[..., moving]) / units[:, None, moving]
-    good = np.isfinite(slope).all(axis=(1, 2))
-    _, r, W = np.linalg.svd(np.where(good[:, None, None], slope, 0.0))
-    drive_margin = np.where(good, r[:, -1], np.nan)
-    return margin, direction, drive_margin, moving[np.abs(W[:, r.shape[1] - 1]).argmax(axis=1)]

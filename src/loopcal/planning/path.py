@@ -3,9 +3,9 @@
 
 A path is straight in the controlled coordinates: positions and angles change evenly, the shorter
 way round, and a tilt given by phi and theta changes as the vector (theta cos phi, theta sin phi),
-which is regular at zero tilt. Paths are checked in small steps, many paths at once. A step is
-solved as its pose is commanded or, where a pose has several sets of readings, from the step before,
-so that a path keeps its branch; it must end with the readings that its end is commanded with.
+which is regular at zero tilt. Paths are checked in small steps, many paths at once. Each step is
+solved as its pose is commanded, from home; where a pose has several sets of readings, or infinitely
+many with spare drives, they must not jump from one step to the next.
 
 The order of visiting comes from nearest neighbors with several first poses, each improved by
 reversing sections while that makes the path shorter (2-opt, Croes 1958,
@@ -23,21 +23,17 @@ import numpy as np
 
 from loopcal import geometry
 from loopcal.errors import MechanismError
-from loopcal.mechanism.chains import has_spare_drives
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import TILT, list_dimensions, read_coordinates
-from loopcal.mechanism.solutions import has_one_solution, inverse
+from loopcal.mechanism.solutions import inverse
 from loopcal.planning import constraints
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension
 
 STEPS = 40  # steps in which a path as long as the robot's size, or one radian, is checked
-AT_ONCE = 4096  # paths that are checked at once
-POSES_AT_ONCE = 1 << 14  # poses of them, where a pose does not depend on the one before
-# Difference of readings, in the robot's size or in radians, above which a path ended on another
-# branch than its end.
-BRANCH = 1e-6
-JUMP = 4.0  # times the mean step of its path: a longer step of spare drives is no even motion
+AT_ONCE = 4096  # paths of one number of steps
+POSES_AT_ONCE = 1 << 12  # poses that are checked at once
+JUMP = 4.0  # times the median step of its path: a longer step of readings is no even motion
 FIRST_POSES = 8  # first poses that the order of visiting tries
 # Share of the length by which a path must become shorter to count: rounding is no gain.
 LEAST_GAIN = 1e-12
@@ -101,63 +97,24 @@ def check_paths(
         [robot.size if a.dimension is Dimension.LENGTH else 1.0 for a in robot.actuators]
     )
     for first in range(0, n, AT_ONCE):  # paths of similar length, in the same number of steps
-        left = order[first : first + AT_ONCE]
-        count = max(int(np.ceil(steps * (float(distance[left].max()) / robot.size))), 4)
-        if has_one_solution(robot) or has_spare_drives(robot):
-            violations[left] = _check_at_once(checker, start[left], end[left], count, scale)
-            # a step in another mode than home may still follow from the step before it
-            left = left[[v is not None and v.code == "other-mode" for v in violations[left]]]
-            if not len(left):
-                continue
-        solution = inverse(robot, start[left])
-        for i in range(count + 1):
-            if i:
-                point = interpolate_path(robot, start[left], end[left], i / count)
-                solution = inverse(robot, point, solution)
-            step = checker.check_poses(solution, at_pose=False)
-            violations[left] = step.violations
-            left, solution = left[step.allowed], solution.take(step.allowed)
-            if not len(left):
-                break
-        else:
-            difference = np.abs(solution.q - inverse(robot, end[left]).q) / scale
-            violations[left[~(difference <= BRANCH).all(axis=1)]] = constraints.Violation(
-                "branch-changed"
-            )
-    allowed = np.array([violation is None for violation in violations], dtype=bool)
-    return constraints.ConstraintCheck(allowed, violations)
-
-
-def _check_at_once(
-    checker: constraints.ConstraintChecker,
-    start: FloatArray,
-    end: FloatArray,
-    count: int,
-    scale: FloatArray,
-) -> list[constraints.Violation | None]:
-    """Return the first violations of n paths, all of whose steps are solved from home at once: of a
-    machine whose poses have one set of readings, or whose spare drives have those of the least
-    motion from home. These may jump by several `scale` (a,) from one step to the next.
-    """
-    share, first = np.arange(count + 1) / count, list[constraints.Violation | None]()
-    branch, may_jump = constraints.Violation("branch-changed"), has_spare_drives(checker.robot)
-    at_once = max(POSES_AT_ONCE // len(share), 1)
-    for i in range(0, len(start), at_once):
-        begin, goal = (
-            np.repeat(ends[i : i + at_once], len(share), axis=0) for ends in (start, end)
-        )
-        shares = np.tile(share, len(begin) // len(share))
-        solution = inverse(checker.robot, interpolate_path(checker.robot, begin, goal, shares))
-        check = checker.check_poses(solution, at_pose=False, steps=len(share))
-        step = check.allowed.reshape(-1, len(share)).argmin(axis=1)
-        found = check.violations.reshape(-1, len(share))[np.arange(len(step)), step]
-        if may_jump:
-            q = (solution.q / scale).reshape(len(step), len(share), -1)
+        alike = order[first : first + AT_ONCE]
+        count = max(int(np.ceil(steps * (float(distance[alike].max()) / robot.size))), 4)
+        for i in range(0, len(alike), size := max(POSES_AT_ONCE // (count + 1), 1)):
+            paths = alike[i : i + size]
+            begin, goal = (np.repeat(ends[paths], count + 1, axis=0) for ends in (start, end))
+            share = np.tile(np.arange(count + 1) / count, len(paths))
+            solution = inverse(robot, interpolate_path(robot, begin, goal, share))
+            check = checker.check_poses(solution, at_pose=False, steps=count + 1)
+            allowed = check.allowed.reshape(-1, count + 1)
+            step = np.arange(len(paths)), allowed.argmin(axis=1)
+            found = check.violations.reshape(allowed.shape)[step]
+            q = (solution.q / scale).reshape(*allowed.shape, -1)
             length = np.linalg.norm(np.diff(q, axis=1), axis=2)
-            jumps = ~(length.max(axis=1) <= JUMP * length.mean(axis=1))
-            found[jumps & check.allowed.reshape(-1, len(share)).all(axis=1)] = branch
-        first += found.tolist()
-    return first
+            jumps = length.max(axis=1) > JUMP * np.median(length, axis=1)
+            found[jumps & allowed.all(axis=1)] = constraints.Violation("branch-changed")
+            violations[paths] = found
+    are_allowed = np.array([violation is None for violation in violations], dtype=bool)
+    return constraints.ConstraintCheck(are_allowed, violations)
 
 
 def _tilt_vector(coordinates: FloatArray, places: list[int]) -> np.ndarray:
