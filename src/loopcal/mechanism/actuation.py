@@ -168,17 +168,24 @@ def differentiate_at_pose(
     with np.errstate(all="ignore"):
         slopes = moved.readings[:, :, :a, robot.is_commanded]
         readings[:, :, robot.is_commanded] = own / np.einsum("...jj->...j", slopes)[..., None]
-    names, nodes = [*name_passive_joints(robot)], np.zeros((*twists.shape[:2], 6, p + m))
-    for node, (body, T) in enumerate(zip(robot.assembly.bodies, state.others, strict=True), 1):
-        columns = [(i, f) for i, (own, f) in enumerate(program.unknown_twists) if own == node]
-        nodes[:] = 0.0
-        for i, f in columns:
-            nodes[:, :, f] = twists[:, :, i]
+    names, nodes = [*name_passive_joints(robot)], spread_twists(program, twists, len(program.nodes))
+    for i, (body, T) in enumerate(zip(robot.assembly.bodies, state.others, strict=True), 1):
         names += name_entries(body)
-        passive = np.concatenate([passive, geometry.differentiate_entries(T) @ nodes], axis=2)
+        entries = geometry.differentiate_entries(T) @ nodes[:, :, 6 * i : 6 * i + 6]
+        passive = np.concatenate([passive, entries], axis=2)
     return PoseDrivenSensitivity(
         tuple(names), (readings[..., :p], readings[..., p:]), (passive[..., :p], passive[..., p:])
     )
+
+
+def spread_twists(program: Program, moved: FloatArray, nodes: int = 1) -> FloatArray:
+    """Return the twists (t, n, 6 nodes, w) of the first nodes, of the freedoms of all nodes first
+    among unknowns (t, n, u, w).
+    """
+    freedoms = [6 * node + f for node, f in program.unknown_twists if node < nodes]
+    out = np.zeros((*moved.shape[:2], 6 * nodes, moved.shape[3]))
+    out[:, :, freedoms] = moved[:, :, : len(freedoms)]
+    return out
 
 
 # Driven joints l whose sums are given, s(q) = W l, where the sums of readings and of couplings

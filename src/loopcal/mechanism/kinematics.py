@@ -19,7 +19,7 @@ from loopcal import engine
 from loopcal.engine import State
 from loopcal.mechanism.actuation import ITERATIONS, DrivenJoints, drive_joints, scale_sums
 from loopcal.mechanism.chains import ChainState, each_stage, join_stage_states, locate_stage_bases
-from loopcal.mechanism.limb_rows import Placed, follow_limb, follow_links, place_serial
+from loopcal.mechanism.limb_rows import Placed, follow_links, place_links, place_serial
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.sensitivity import differentiate_pose
 from loopcal.mechanism.states import Status, driven_values, list_bodies, replace_rows, without_poses
@@ -386,9 +386,10 @@ def compute_limb_frames(
     for group, joints in zip(robot.program.groups, state.joints, strict=True):
         displacements = e[:, group.columns].reshape(len(e), len(group.limbs), -1)
         for k, limb in enumerate(group.limbs):
-            chain, attachment = follow_limb(group, k, displacements[:, k], joints[:, :, k])
+            links, advance = (a[:, None] for a in place_links(group, k, displacements[:, k]))
+            chain = follow_links(group.joints, links, advance, joints[:, :, k])
             placed = [bodies[group.on[k]] @ frame for frame in chain]
-            placed.append(bodies[group.to[k]] @ attachment)
+            placed.append(bodies[group.to[k]] @ links[:, :, -1])
             frames[limb] = np.stack([np.broadcast_to(f, shape) for f in placed], axis=2)
     return tuple(frames[i] for i in sorted(frames))
 

@@ -17,6 +17,7 @@ from loopcal.engine import LENGTH, PITCH, Group, Program, State
 from loopcal.mechanism.assembly import Joint
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.states import driven_values
+from loopcal.mechanism.transmission import invert_weights
 from loopcal.numerics.trial_batch import map_arrays
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
@@ -32,18 +33,6 @@ def name_passive_joints(robot: Mechanism) -> tuple[str, ...]:
 def name_entries(body: str) -> tuple[str, ...]:
     """Return the names of the twelve numbers of the pose of a body, [R t] row by row."""
     return tuple(f"{body}:T{row}{column}" for row in (1, 2, 3) for column in (1, 2, 3, 4))
-
-
-def solve_passive_motion(U: FloatArray, right: FloatArray) -> FloatArray:
-    """Return -U^-1 right for upper triangular U (t, n, u, u) and right (t, n, u, c); a pivot of
-    zero gives infinities or NaN.
-    """
-    out = np.empty_like(right)
-    with np.errstate(all="ignore"):
-        for i in range(U.shape[-1] - 1, -1, -1):
-            known = (U[..., i, i + 1 :, None] * out[..., i + 1 :, :]).sum(axis=-2)
-            out[..., i, :] = -(right[..., i, :] + known) / U[..., i, i, None]
-    return out
 
 
 class LimbRows(NamedTuple):
@@ -136,7 +125,7 @@ def move_passive_joints(
                 moved[..., : slopes.shape[2]] += np.matmul(own.E, slopes[:, None, own.slots])
                 limb = limbs[own.limb]
                 places = [names.index(f"{limb.name}.{limb.joints[j].name}") for j in own.joints]
-                out[rows][:, :, places] = solve_passive_motion(own.U, moved)
+                out[rows][:, :, places] = -np.matmul(invert_weights(own.U), moved)
     for i, (_, joint) in enumerate(robot.assembly.passive_joints):
         if joint.actuator is not None:  # the pin of a triangle, which its drive turns
             out[:, :, i] = driven[:, :, robot.assembly.driven_joints.index(joint.actuator)]
@@ -190,19 +179,6 @@ def reduce_to_platform(
 
 
 # Frames along a limb for displacements and joint values.
-
-
-def follow_limb(
-    group: Group, k: int, displacements: FloatArray, joints: FloatArray
-) -> tuple[list[FloatArray], FloatArray]:
-    """Return the frames (t, n | 1, 4, 4) behind each link 0..J of limb k in the body where it
-    begins, the last one the tip, and the attachment (t, 1, 4, 4) in the body where it ends.
-
-    displacements : (t, s) of this limb. joints : (t, n, J + 1) its joint values.
-    """
-    links, advance = place_links(group, k, displacements)
-    frames = follow_links(group.joints, links[:, None], advance[:, None], joints)
-    return frames, links[:, None, -1]
 
 
 def follow_links(

@@ -26,6 +26,7 @@ from loopcal.mechanism.actuation import (
     differentiate_open_sums,
     differentiate_unknowns_by_sums,
     drive_joints,
+    spread_twists,
 )
 from loopcal.mechanism.chains import each_stage, locate_bodies, transport_to_end
 from loopcal.mechanism.least_squares_closure import (
@@ -82,16 +83,6 @@ def differentiate_pose(
         for derivative in derivatives:
             derivative[lost] = np.nan
     return Derivatives(*derivatives)
-
-
-def spread_twists(program: engine.Program, moved: FloatArray, nodes: int = 1) -> FloatArray:
-    """Return the twists (t, n, 6 nodes, w) of the first nodes, of the freedoms of all nodes first
-    among unknowns (t, n, u, w).
-    """
-    freedoms = [6 * node + f for node, f in program.unknown_twists if node < nodes]
-    out = np.zeros((*moved.shape[:2], 6 * nodes, moved.shape[3]))
-    out[:, :, freedoms] = moved[:, :, : len(freedoms)]
-    return out
 
 
 def differentiate_platform(
