@@ -120,10 +120,12 @@ def _write_compensation(robot: Mechanism, targets: np.ndarray) -> str:
 
 
 def bench_sessions() -> Metric:
-    """Calibrate with 100 sessions against 25, four poses of each, frame and targets unknown."""
+    """Calibrate with 100 sessions against 25, and the error budget: four poses of each, frame and
+    targets unknown.
+    """
     robot, counts = load_robot("hexapod-42"), (25, 100)
     data = [draw_sessions(robot, 4 * n, n, 3) for n in counts]
-    few, many = (lambda d=d: calibrate(robot, d) for d in data)
+    few, many = (lambda d=d: calibrate(robot, d).budget for d in data)
     name = "growth.calibration_of_sessions"
     return _growth(name, few, many, counts, time.process_time)
 

@@ -69,15 +69,14 @@ def test_budget_is_computed_when_it_is_asked_for_and_the_fit_is_linearized_once(
     robot, data, monkeypatch
 ):
     budget = Mock(side_effect=calibration.compute_error_budget)
-    linearized = Mock(side_effect=fit_linearization.linearize_at_estimate)
+    linearized = Mock(side_effect=fit_linearization.problem_of)
     monkeypatch.setattr(calibration, "compute_error_budget", budget)
-    monkeypatch.setattr(fit_linearization, "linearize_at_estimate", linearized)
+    monkeypatch.setattr(fit_linearization, "problem_of", linearized)
     found = calibrate(robot, data, CalibrationOptions(hold_out=0.25))
     assert budget.call_count == 0
     assert found.budget is found.budget
     assert budget.call_count == 1
-    # with columns of errors, it is linearized again at the same solution
-    assert sum(len(call.args) == 2 for call in linearized.call_args_list) == 1
+    assert linearized.call_count == 1
 
 
 def test_good_calibration_reaches_the_noise_floor_and_has_a_next_step(report):

@@ -109,7 +109,7 @@ def list_arrays(at: Linearization) -> list[np.ndarray]:
     result = [at.factor, at.cost, at.equations, at.next_start.nuisance]
     if at.nuisance is not None:
         done = at.nuisance.elimination
-        result += [at.nuisance.best, done.slope, done.rank, done.variances()]
+        result += [at.nuisance.best, done.slope, done.rank, *done.roots]
     if at.poses is not None:
         result += [at.poses.states.q, at.poses.states.state.T, at.poses.rank]
     return result

@@ -412,7 +412,7 @@ def _separate_setup(
 
     a null space of p unknowns t and b, however many clusters there are.
     """
-    p, slope = len(errors[0]), done.slope[0]
+    p, slope, root = len(errors[0]), done.slope[0], done.list_root()
     members: dict[int, list[int]] = {}
     for i in np.flatnonzero(kept).tolist():
         cluster = done.tree.cluster[factors[i].unknowns[:1]]
@@ -426,7 +426,7 @@ def _separate_setup(
             continue
         whole = factors[group[0]].unknowns
         motion = noise * np.concatenate([factors[i].setup for i in group]).T
-        D = done.joint_root(whole)[is_setup[whole]] @ motion
+        D = root.fill(whole)[is_setup[whole]] @ motion
         e = np.concatenate([errors[i] for i in group], axis=1)
         length = np.sqrt((D**2).sum(axis=1) + ((slope[unknowns] @ e) ** 2).sum(axis=1))
         length = np.where(length > 0.0, length, 1.0)[:, None]

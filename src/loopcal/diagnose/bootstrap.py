@@ -204,9 +204,11 @@ def compute_robust_spread(linear: FitLinearization, clusters: Clusters) -> Robus
     for rows_of_block in linear.problem.leverage_rows(linear.linearization, linear.solution):
         for part in rows_of_block:
             member = clusters.member[part.poses]
-            rows, m = part.spread(setup)[member >= 0], part.rows.shape[1]
+            own, machine = np.split(part.rows, [part.unknowns.shape[1]], axis=2)
+            whole = np.concatenate([spread_columns(own, part.unknowns, setup), machine], axis=2)
+            rows = whole[member >= 0]
             if rows.size:
-                places = np.repeat(member[member >= 0], m)
+                places = np.repeat(member[member >= 0], rows.shape[1])
                 folded = fold_at(folded, rows.reshape(1, -1, width), places)
     rows = folded[0] / np.r_[np.ones(width - 1), sigma]
     nuisance, A, r = rows[..., : -p - 1], rows[..., -p - 1 : -1], rows[..., -1]
@@ -255,7 +257,9 @@ def list_observed_values(linear: FitLinearization, clusters: Clusters) -> Observ
     z, trials, estimate = linearization.deviation, problem.trials, linearization.nuisance
     fixed = None if estimate is None else estimate.values
     solution = problem.poses.solve(z, trials, linearization.next_start, problem.control, fixed)
-    root = np.zeros((0, 0)) if estimate is None else estimate.elimination.joint_root()
+    root = np.zeros((0, 0))
+    if estimate is not None:
+        root = estimate.elimination.list_root().fill(np.arange(estimate.values.shape[1]))
     links = max(rows.poses_by_link.shape[1] for rows in problem.rows)
     parts, coordinates = [], []
     for block, poses in problem.poses.iterate_poses(solution, z):
@@ -267,7 +271,7 @@ def list_observed_values(linear: FitLinearization, clusters: Clusters) -> Observ
             component = of_row[np.arange(len(place)), column]
             own = linearize_rows(rows, poses, trials, fixed)
             by_parameters = own.by_parameters[0]
-            by_nuisance = np.zeros((*by_parameters.shape[:2], len(root)))
+            by_nuisance = np.zeros((*by_parameters.shape[:2], root.shape[1]))
             if own.by_nuisance is not None and estimate is not None:
                 wide = spread_columns(own.by_nuisance, rows.nuisance, len(root))[0]
                 by_parameters = by_parameters + wide @ estimate.elimination.slope[0]

@@ -583,7 +583,7 @@ def describe_density(linear: FitLinearization) -> PosteriorDensity:
     setup_root, rank = np.zeros((0, 0)), 0
     nuisance = linear.linearization.nuisance
     if nuisance is not None:
-        joint = scale * nuisance.elimination.joint_root()
+        joint = scale * nuisance.elimination.list_root().fill(np.arange(nuisance.values.shape[1]))
         setup_root = joint[:, (joint != 0.0).any(axis=0)]
         rank = int(nuisance.elimination.rank[0])
     prior = None if fit.options.prior is None else fit.options.prior.added(linear.problem)

@@ -37,7 +37,7 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 
 from loopcal.diagnose.residual_patterns import ResidualRows, collect_residual_rows, collect_rows
-from loopcal.estimate.fit_linearization import FitLinearization, linearize_smooth_errors
+from loopcal.estimate.fit_linearization import FitLinearization, fold_smooth_errors
 from loopcal.estimate.free_parameters import choose_pivots
 from loopcal.estimate.identification import prepare_fitted_data
 from loopcal.estimate.posterior import DISCREPANCY, ModelDiscrepancy, combine_degrees
@@ -118,7 +118,9 @@ def check_map(
 
 def collect_columns(linear: FitLinearization, errors: SmoothErrors) -> FloatArray:
     """Return the columns (R, m) of smooth errors in the rows of a fit of exact readings."""
-    stacked = collect_rows(linear.data, *linearize_smooth_errors(linear, errors))
+    problem, solution = linear.problem.with_errors(errors, linear.solution)
+    apart = replace(linear.linearization, nuisance=None)  # the setup takes up no part of them
+    stacked = collect_rows(linear.data, problem, problem.leverage_rows(apart, solution))
     assert stacked is not None
     return stacked.columns.wide[:, -errors.count :]
 
@@ -294,8 +296,8 @@ def exclude_slow_errors(
     noise: what other errors than these show.
     """
     columns = rows.project(collect_columns(linear, slow.rows.errors.scaled(slow.amplitude)))
-    u, s, _ = np.linalg.svd(columns, full_matrices=False)
-    return rows.with_effects(u[:, s**2 > slow.errors[-1].size.noise])
+    u, variances = _find_axes(columns)
+    return rows.with_effects(u[:, variances > slow.errors[-1].size.noise])
 
 
 def add_slow_errors(fit: Identification, slow: SlowErrors) -> Identification:
@@ -445,7 +447,6 @@ def project_slow_errors(linear: FitLinearization, errors: SmoothErrors) -> SlowE
     """
     if len(errors.centers) < FEWEST_POSES:
         return None
-    extended = linearize_smooth_errors(linear, errors)[2]
     d, m, used = linear.decomposition, errors.count, linear.decomposition.used[0]
     k = int(used.sum())
     to_z = d.directions[0][:, used]
@@ -453,13 +454,13 @@ def project_slow_errors(linear: FitLinearization, errors: SmoothErrors) -> SlowE
     prior = np.zeros((k, k + m + 1))
     prior[:, :k] = np.diag(np.sqrt(penalty))
     prior[:, -1] = np.sqrt(penalty) * d.coordinates(linear.linearization.deviation)[0][used]
-    factor, p = extended.factor[0], len(used)
+    factor, p = fold_smooth_errors(linear, errors), len(used)
     factor = factor[factor.any(axis=1)]  # there may be fewer rows than coefficients
     # only the first rows of a triangle have columns of the parameters
     first = np.concatenate([factor[:p, :p] @ to_z, factor[:p, p:]], axis=1)
     top = np.asarray(np.linalg.qr(np.concatenate([first, prior[penalty > 0.0]]), mode="r"))
     rest = np.linalg.qr(np.concatenate([factor[p:, p:], top[k:, k:]]), mode="r")
-    degrees = int(extended.equations[0] + (penalty > 0.0).sum()) - k
+    degrees = int(linear.linearization.equations[0] + (penalty > 0.0).sum()) - k
     if degrees < FEWEST_DEGREES:
         return None
     slope = linear.fit.tolerance[:, None] * (to_z @ np.linalg.solve(top[:k, :k], top[:k, k:-1]))

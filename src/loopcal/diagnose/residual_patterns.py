@@ -16,7 +16,7 @@ Source: Durbin and Watson, Testing for serial correlation in least squares regre
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from loopcal.estimate.fit_linearization import FitLinearization, linearize_fit
 from loopcal.estimate.identification import prepare_fitted_data
-from loopcal.estimate.linearization import Linearization, PoseSolution
+from loopcal.estimate.linearization import LeverageRows
 from loopcal.estimate.problem import Problem
 from loopcal.estimate.residual_test import FALSE_ALARMS
 from loopcal.estimate.result import Identification
@@ -191,14 +191,14 @@ class StackedRows(NamedTuple):
 
 
 def collect_rows(
-    data: Measurements, problem: Problem, solution: PoseSolution, linearization: Linearization
+    data: Measurements, problem: Problem, blocks: Iterable[Sequence[LeverageRows]]
 ) -> StackedRows | None:
-    """Return the measured rows of a problem of exact readings; None without any."""
+    """Return the measured rows of a problem of exact readings, block by block; None without any."""
     observations = [rows for rows in data.observations if len(rows)]
     moved: list[tuple[FloatArray, IntArray]] = []  # present rows by setup parameters
     groups: list[tuple[FloatArray, IntArray, IntArray, IntArray]] = []  # and by the others
-    for node_rows in problem.leverage_rows(linearization, solution):
-        for part in node_rows:
+    for block in blocks:
+        for part in block:
             present = np.diagonal(observations[part.kind].whitener, axis1=1, axis2=2) != 0.0
             i, own = np.nonzero(present[part.numbers[:, None], part.columns])
             kind, w = np.full(len(i), part.kind), part.unknowns.shape[1]
@@ -225,7 +225,8 @@ def collect_residual_rows(linear: FitLinearization) -> ResidualRows | None:
     """
     if linear.problem.is_uncertain:
         return None
-    stacked = collect_rows(linear.data, linear.problem, linear.solution, linear.linearization)
+    blocks = linear.problem.leverage_rows(linear.linearization, linear.solution)
+    stacked = collect_rows(linear.data, linear.problem, blocks)
     if stacked is None:
         return None
     d, wide, setup = linear.decomposition, stacked.columns.wide, linear.linearization.nuisance

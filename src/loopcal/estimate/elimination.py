@@ -185,7 +185,8 @@ def plan_elimination(
     """
     if not len(local):
         return None
-    is_free = np.asarray(local.table.free, dtype=bool)
+    used = np.concatenate([r.nuisance.ravel() for r in rows])  # others are fixed
+    is_free = np.isin(np.arange(len(local)), used) & local.table.free
     scopes = [p.scope for p in local.table.entries]
     if member is None:  # rows of poses with coordinates are eliminated together
         for i in (i for r in rows for i in r.list_target_parameters().tolist()):

@@ -436,7 +436,10 @@ def measure_block_distances(
         each = np.where(present, kind.whitened[0] ** 2, 0.0).sum(axis=1)
         square += np.bincount(blocks, each, count)
         degrees += np.bincount(blocks, present.sum(axis=1), count)
-    return np.sqrt(square), degrees - problem.count_pose_directions(solution, member, count)
+    if solution.estimates is not None:  # free poses take up residuals
+        of_poses = member[problem.poses.first_pose]
+        degrees -= np.bincount(of_poses, solution.estimates.rank[0], count)
+    return np.sqrt(square), degrees
 
 
 def estimate_scale_of(distance: FloatArray, degrees: FloatArray) -> float:

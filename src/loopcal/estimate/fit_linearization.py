@@ -38,12 +38,13 @@ from loopcal.estimate.smooth_errors import SmoothErrors
 from loopcal.measure.array_checks import drop_repeats, take_rows
 from loopcal.measure.measurements import Measurements
 from loopcal.mechanism.model import Mechanism
-from loopcal.numerics.decomposition import Decomposition
+from loopcal.numerics.decomposition import Decomposition, empty_factor
 from loopcal.numerics.elimination import UnknownRoot, eliminate_columns, spread_columns
 from loopcal.numerics.statistics import find_distinct
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
 MOST_KEPT = 50_000_000  # derivatives of poses that are kept for the rows of a fit, at most
+PART = 20_000  # residuals, about, whose rows by errors of the poses are made together
 
 
 class FitLinearization(NamedTuple):
@@ -114,53 +115,41 @@ def linearize_fit(
     if linear is not None and fit.residual_test is linear.fit.residual_test:
         return linear._replace(fit=fit)
     data = prepare_fitted_data(fit, data)
-    problem, solution, rows = linearize_at_estimate(fit, data)
-    method, z, tolerance = fit.method, rows.deviation, fit.spectrum.tolerance
+    setup = data.nuisance_parameters if fit.options.nuisance is None else fit.options.nuisance
+    problem = problem_of(fit.free_parameters, data, setup).weighted(fit.pose_weights)
+    z = problem.free.deviation(fit.robot.values[None])
+    start = problem.start(z, seek=False).with_nuisance(fit.nuisance.estimate[None])
+    kept = 6 * data.n_poses * len(problem.free) <= MOST_KEPT  # or computed when needed
+    solution = problem.solve(z, start, derivatives=kept)
+    rows = problem.linearize_at(z, start, solution)
+    if fit.options.prior is not None:
+        rows = fit.options.prior.added(problem).append(rows)
+    method, tolerance = fit.method, fit.spectrum.tolerance
     d = decompose_for(method, rows.factor, rows.equations, z, tolerance)
     penalty = np.array(method.penalty(d), dtype=np.float64)
     sources = find_variance_sources(d, penalty, fit.residual_test, method, fit.free_parameters)
     return FitLinearization(fit, data, problem, solution, rows, d, penalty, sources)
 
 
-def linearize_smooth_errors(
-    linear: FitLinearization, errors: SmoothErrors
-) -> tuple[Problem, PoseSolution, Linearization]:
-    """Linearize the rows of a fit also by the coefficients of errors of the poses, whose columns
-    follow those of the parameters. Poses and nuisance parameters stay those of `linear`.
+def fold_smooth_errors(linear: FitLinearization, errors: SmoothErrors) -> FloatArray:
+    """Return the factor (p + m + 1, p + m + 1) of the rows of a fit by its parameters and the m
+    coefficients of errors of the poses; poses and nuisance parameters stay those of `linear`.
     """
-    solution, free = linear.solution, replace(linear.fit.free_parameters, errors=errors)
-    if solution.linearized is not None:
-        solution = replace(solution, linearized=solution.linearized.with_errors(errors))
-    return linearize_at_estimate(linear.fit, linear.data, free, solution)
-
-
-def linearize_at_estimate(
-    fit: Identification,
-    data: Measurements,
-    free: FreeParameters | None = None,
-    solution: PoseSolution | None = None,
-) -> tuple[Problem, PoseSolution, Linearization]:
-    """Return the weighted problem of a fit, its solution at the estimate, and its linearization
-    there with an earlier calibration.
-
-    `data` are of the same poses, such as with another sigma. Where `free` has columns of errors,
-    they have no part in the rank of the machine, and the solution is given.
-    """
-    setup = data.nuisance_parameters if fit.options.nuisance is None else fit.options.nuisance
-    problem = problem_of(fit.free_parameters if free is None else free, data, setup).weighted(
-        fit.pose_weights
+    at, (whole, solution) = (
+        linear.linearization,
+        linear.problem.with_errors(errors, linear.solution),
     )
-    z = problem.free.deviation(fit.robot.values[None])
-    start = problem.start(z, seek=False).with_nuisance(fit.nuisance.estimate[None])
-    if solution is None:
-        kept = 6 * data.n_poses * len(problem.free) <= MOST_KEPT  # or computed when needed
-        solution = problem.solve(z, start, derivatives=kept)
-    else:
-        problem = replace(problem, consistent=None)
-    linearization = problem.linearize_at(z, start, solution)
-    if fit.options.prior is not None:
-        linearization = fit.options.prior.added(problem).append(linearization)
-    return problem, solution, linearization
+    z = np.pad(at.deviation, ((0, 0), (0, errors.count)))
+    start = replace(at.next_start, deviation=z, poses=None, is_near=False)
+    factor = empty_factor(1, z.shape[1])
+    for problem in whole.divide(PART):  # all rows together would take most of the memory
+        known = solution
+        if problem is not whole:
+            known = problem.solve(z, start, solution.nuisance, derivatives=True)
+        factor = engine.fold(factor, problem.linearize_at(z, start, known).factor)
+    if (prior := linear.fit.options.prior) is not None:
+        factor = prior.added(whole).append(replace(at, deviation=z, factor=factor)).factor
+    return factor[0]
 
 
 # What a fit knows of machine and nuisance parameters together, to predict other measurements.

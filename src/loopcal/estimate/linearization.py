@@ -35,7 +35,7 @@ from loopcal.mechanism.actuation import DrivenJoints
 from loopcal.mechanism.kinematics import drive_loops
 from loopcal.mechanism.sensitivity import differentiate_pose, differentiate_sensed_values
 from loopcal.mechanism.states import Status
-from loopcal.numerics.elimination import spread_columns, without_rounding
+from loopcal.numerics.elimination import without_rounding
 from loopcal.numerics.trial_batch import TrialBatch, map_arrays
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
@@ -119,11 +119,6 @@ class LeverageRows(NamedTuple):
     kind: int
     numbers: IntArray
     columns: IntArray
-
-    def spread(self, count: int) -> FloatArray:
-        """Return the rows (k, m, U + p + 1) by all U nuisance parameters."""
-        moved, machine = np.split(self.rows, [self.unknowns.shape[1]], axis=2)
-        return np.concatenate([spread_columns(moved, self.unknowns, count), machine], axis=2)
 
 
 @dataclass(frozen=True, eq=False)

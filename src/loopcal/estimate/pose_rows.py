@@ -653,7 +653,7 @@ def divide_into_runs(
     ]
 
     def add(poses: IntArray, chosen: tuple[IntArray, ...]) -> None:
-        own = tuple(r.divided() for r in _take_rows(rows, poses, chosen, n))
+        own = tuple(r.divided() for r in take_rows(rows, poses, chosen, n))
         members = tuple(list_members(nuisance, r) for r in own)
         blocks.append(PoseBlock(poses, chosen, own, is_needed[poses], members))
 
@@ -692,13 +692,13 @@ def divide_into_components(
     for k in find_distinct(block):
         chosen = tuple(np.flatnonzero(block[r.first_poses] == k) for r in rows)
         poses = np.flatnonzero(block == k)
-        own = _take_rows(rows, poses, chosen, len(member))
+        own = take_rows(rows, poses, chosen, len(member))
         groups = _group_components(own, member[poses], nodes, structures)
         blocks.append(PoseBlock(poses, chosen, own, is_needed[poses], groups=groups))
     return tuple(blocks)
 
 
-def _take_rows(
+def take_rows(
     rows: Sequence[ObservationRows], poses: IntArray, chosen: tuple[IntArray, ...], n: int
 ) -> tuple[ObservationRows, ...]:
     """Return the chosen rows of every kind, whose poses are among poses (b,) of n, by these."""

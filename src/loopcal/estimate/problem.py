@@ -23,6 +23,7 @@ exactly the gaps that were recorded (`ConsistentPoses`).
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
@@ -54,7 +55,8 @@ from loopcal.estimate.pose_coordinates import (
     ReadingCoordinates,
     TwistCoordinates,
 )
-from loopcal.estimate.pose_rows import BLOCK, PoseBlock, PoseRows, find_components
+from loopcal.estimate.pose_rows import BLOCK, PoseBlock, PoseRows, find_components, take_rows
+from loopcal.estimate.smooth_errors import SmoothErrors
 from loopcal.measure.initial_values import guess_nuisance_values
 from loopcal.measure.kinds.kind import Evaluation, Kind
 from loopcal.measure.measurements import Measurements, anchor_rows
@@ -65,6 +67,7 @@ from loopcal.mechanism.model import Mechanism
 from loopcal.numerics.decomposition import RANK_TOLERANCE, are_nonzero, empty_factor
 from loopcal.numerics.elimination import NodeFactors, spread_columns
 from loopcal.numerics.gauss_newton import Halving
+from loopcal.numerics.statistics import find_distinct
 from loopcal.numerics.trial_batch import select_counts
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension
@@ -264,6 +267,38 @@ class Problem:
         """Return the problem of other rows of the same kinds and poses."""
         return replace(self, poses=replace(self.poses, rows=tuple(rows)))
 
+    def with_errors(
+        self, errors: SmoothErrors, solution: PoseSolution
+    ) -> tuple[Problem, PoseSolution]:
+        """Return the problem and a solution with the coefficients of errors of the poses as more
+        parameters, which have no part in the rank of the machine.
+        """
+        known = solution.linearized
+        solution = replace(solution, linearized=known and known.with_errors(errors))
+        free, coordinates = replace(self.free, errors=errors), copy(self.poses.coordinates)
+        coordinates.free = free
+        poses = replace(self.poses, free=free, coordinates=coordinates)
+        return replace(self, poses=poses, consistent=None), solution
+
+    def divide(self, most: int) -> Iterator[Problem]:
+        """Give problems of about `most` residuals each, which share no setup parameters, with the
+        poses of these alone (one trial); this one where it is small, has none, or poses are free.
+        """
+        if self.nuisance is None or self.is_uncertain or self.residual_count[0] <= most:
+            yield self
+            return
+        local, cluster, n = self.nuisance.local, self.nuisance.tree.cluster, self.readings.shape[1]
+        groups = [cluster[r.nuisance].max(axis=1, initial=-1) + 1 for r in self.rows]
+        sizes = [np.full(len(r.poses), r.whitener.shape[-1]) for r in self.rows]
+        size = np.bincount(np.concatenate(groups), np.concatenate(sizes))
+        part = (np.cumsum(size) - size) // most
+        for number in find_distinct(part[size > 0]):
+            chosen = tuple(np.flatnonzero(part[group] == number) for group in groups)
+            used = [r.poses[own].ravel() for r, own in zip(self.rows, chosen, strict=True)]
+            poses = find_distinct(np.concatenate(used))
+            rows, readings = take_rows(self.rows, poses, chosen, n), self.readings[:, poses]
+            yield make_exact_problem(self.free, readings, rows, 1, local, self.data)
+
     def weighted(self, weight: FloatArray) -> Problem:
         """Return the problem with a factor (n,) on each pose's squares, its readings included, or
         with factors (t, n) of each trial.
@@ -443,18 +478,6 @@ class Problem:
         for block, node_rows, _ in self.poses.iterate_rows(solution, z, self.trials):
             of_poses = [part for part in node_rows if part.kind not in of_base]
             yield list(spread_rows(self.poses, block, of_poses, at_nodes))
-
-    def count_pose_directions(
-        self, solution: PoseSolution, member: IntArray, count: int
-    ) -> IntArray:
-        """Return how many residuals of each of `count` blocks the poses take up (first trial).
-
-        `member` (n,) is the block of each pose. Poses of exact readings take up none.
-        """
-        if solution.estimates is None:
-            return np.zeros(count, dtype=np.int64)
-        blocks = member[self.poses.first_pose]
-        return np.bincount(blocks, solution.estimates.rank[0], count).astype(np.int64)
 
     def _eliminate(self, solution: PoseSolution, z: FloatArray, start: Start) -> Linearization:
         """Fold all rows at a solution and eliminate the nuisance parameters."""

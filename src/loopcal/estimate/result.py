@@ -851,7 +851,6 @@ def estimate_nuisance(
     done, is_free = linearization.nuisance.elimination, nuisance.is_free
     V = decomposition.directions[0]
     slope, is_unobservable, root = done.slope[0], done.is_unobservable[0], done.list_root()
-    root = root._replace(values=np.nan_to_num(root.values * np.sqrt(noise), posinf=0.0))
     moved = slope[is_free] @ V
     unknown = np.isinf(variance)
     moved_by_unknown = np.linalg.norm(moved[:, unknown], axis=1)
@@ -866,8 +865,9 @@ def estimate_nuisance(
     square[is_free] = np.where(
         is_infinite | is_unobservable[is_free],
         np.inf,
-        done.variances()[0, is_free] * noise + by_machine,
+        (root.values**2).sum(axis=1)[is_free] * noise + by_machine,
     )
+    root = root._replace(values=np.nan_to_num(root.values * np.sqrt(noise), posinf=0.0))
     return NuisanceEstimate(
         table,
         begin,

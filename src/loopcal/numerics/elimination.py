@@ -402,19 +402,10 @@ class TreeElimination(TrialBatch):
         path = self.tree.structures[structure].path[places]
         return path, self.roots[structure][0][places], self.slope[0][path]
 
-    def joint_root(self, unknowns: IntArray | None = None) -> FloatArray:
-        """Return a square root (u, u) of the covariance, at a known machine, of all unknowns, or of
-        all of some clusters (first trial).
-
-        Its columns belong to independent standard normal variables; see `roots`.
-        """
-        chosen = np.arange(self.shift.shape[1]) if unknowns is None else unknowns
-        unit = np.zeros((self.shift.shape[1], len(chosen)))
-        unit[chosen, np.arange(len(chosen))] = 1.0
-        return self.move_unknowns(unit)[chosen]
-
     def list_root(self) -> UnknownRoot:
-        """Return `joint_root` by its entries: an unknown has those of its path."""
+        """Return a square root (U, U) of the covariance of all unknowns at a known machine, for
+        unit noise (first trial): an unknown has entries in the columns of its path, see `roots`.
+        """
         widest = max((structure.width for structure in self.tree.structures), default=0)
         columns = np.full((self.shift.shape[1], widest), -1)
         values = np.zeros(columns.shape)
@@ -425,7 +416,7 @@ class TreeElimination(TrialBatch):
         return UnknownRoot(columns, values, len(columns))
 
     def move_unknowns(self, x: FloatArray) -> FloatArray:
-        """Return the root of `joint_root` times x (U, c)."""
+        """Return the root of `list_root` times x (U, c)."""
         moved = np.zeros_like(x)
         for structure, root in zip(self.tree.structures, self.roots, strict=True):
             own = root[0, :, : structure.unknowns.shape[1]]
@@ -449,17 +440,6 @@ class TreeElimination(TrialBatch):
             null[own[places], columns[:, None]] /= self.length[0][own[places]]
             first += len(places)
         return np.asarray(null / np.abs(null).max(axis=0, initial=0.0))
-
-    def variances(self) -> FloatArray:
-        """Return the variance (a, U) of each unknown at a known machine, for unit noise.
-
-        It has no meaning where `is_unobservable`.
-        """
-        variance = np.zeros(self.shift.shape)
-        for structure, root in zip(self.tree.structures, self.roots, strict=True):
-            columns = root[:, :, : structure.unknowns.shape[1]]
-            variance[:, structure.unknowns] = (columns**2).sum(axis=-1)
-        return variance
 
 
 def eliminate_tree(factors: NodeFactors) -> tuple[TreeElimination, FloatArray]:

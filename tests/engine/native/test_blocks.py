@@ -11,7 +11,7 @@ from benchmarks.bench_engine import use_engine
 from loopcal import geometry
 from loopcal.engine import BlockRows
 from loopcal.measure.kinds.position import Position
-from loopcal.numerics.elimination import NodeFactors, build_tree, eliminate_tree
+from loopcal.numerics.elimination import NodeFactors, TreeElimination, build_tree, eliminate_tree
 from tests.engine.native.instruction_sets import make_engines
 from tests.engine.native.test_agreement import assert_same_bits
 
@@ -50,10 +50,16 @@ def draw_rows(t: int, open_trial: int | None = None, more: int = 0) -> NodeFacto
     return factors
 
 
+def list_variances(done: TreeElimination) -> np.ndarray:
+    """Return the variance (t, U) of each unknown at a known machine."""
+    trials = [done.take(np.array([i])).list_root().values for i in range(len(done.shift))]
+    return np.array([(values**2).sum(axis=1) for values in trials])
+
+
 def list_results(factors: NodeFactors) -> list[np.ndarray]:
     """Return what no choice of signs changes, unknowns in units of the lengths of their columns."""
     done, rest = eliminate_tree(factors)
-    variance = done.variances() * done.length**2
+    variance = list_variances(done) * done.length**2
     gram = np.swapaxes(rest, 1, 2) @ rest
     values = done.slope * done.length[..., None], done.shift * done.length
     return [gram, *values, variance, done.explained, done.rank, done.is_unobservable]
