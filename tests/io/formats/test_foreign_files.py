@@ -81,7 +81,7 @@ def test_a_configuration_of_several_files_is_corrected(tmp_path, robots) -> None
     ("name", "text", "words"),
     [
         ("a.g", "M669 K10\n", "shipped robot 'rotary-delta'"),
-        ("a.cfg", "[printer]\nkinematics: polar\n", "form no closed loop"),
+        ("a.cfg", "[printer]\nkinematics: polar\n", "in a robot file, as a chain"),
         ("a.cfg", "[printer]\nkinematics: corexy\n", "shipped robot 'core-xy'"),
         ("a.g", "M669 K0\n", "'cartesian'"),
         (

@@ -33,6 +33,7 @@ import numpy as np
 from loopcal.errors import DataError, FileError
 from loopcal.findings import Finding, report_finding
 from loopcal.io.core.yaml_file import format_yaml
+from loopcal.io.formats.delta_gcode import COMMENTS
 from loopcal.io.formats.program_format import (
     DECIMALS,
     Exported,
@@ -46,6 +47,7 @@ from loopcal.io.formats.program_format import (
     format_short,
     get_record,
     round_digits,
+    round_length,
 )
 from loopcal.mechanism.families.gough import Gough, Screw
 from loopcal.mechanism.families.linear_delta import LinearDelta
@@ -175,6 +177,8 @@ def _read_delta(hal: HalFile, home: float | None) -> dict[str, Any]:
         raise hal.error(f"{sentence}. Correct them", "", f"{DELTA}.L")
     content = {"radius": radius, "angles": list(TOWERS), "arms": rod, "readings": "height"}
     content |= {"stops": -math.sqrt(rod**2 - radius**2), "home": {"z": home or 0.0}}
+    half = round_length(0.5 * radius)
+    content["workspace"] = {"x": [-half, half], "y": [-half, half], "z": [0, half]}
     return content | {"stored_parameters": ["radius", "arm*.length", "tower*.stop"]}
 
 
@@ -230,7 +234,8 @@ def read(path: Path, options: ImportOptions) -> Imported:
     what, units = f"{kins.name} settings of LinuxCNC", (unit.symbol, "deg")
     remark = f"Readings are positions of joints: {kins.joints}."
     head = format_head(path, what, family.family, options.name, units, remark)
-    comments = {"stored_parameters": f"what {kins.name} stores", "tolerances": "measured by hand"}
+    comments = {name: COMMENTS[name] for name in ("tolerances", "workspace")}
+    comments["stored_parameters"] = f"what {kins.name} stores"
     return Imported(head + format_yaml(content, comments), None, findings)
 
 
