@@ -73,7 +73,7 @@ def wrong(row, by=1.0) -> str:
 @pytest.mark.slow
 def test_a_session_becomes_the_input_of_a_calibration(measure, rows, loopcal) -> None:
     printed = measure(
-        map(join, rows), "accuracy so far: 90 % of machines", "Next: loopcal calibrate"
+        map(join, rows), "accuracy so far: 90 % of machines", "Next: loopcal calibrate hexapod-42 "
     )
     assert "8 rows" not in printed.words
     assert read_used() == [row[0] for row in rows]

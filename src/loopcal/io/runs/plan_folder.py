@@ -28,6 +28,7 @@ from loopcal.io.core.outputs import FolderKind
 from loopcal.io.core.text_file import open_bytes, read_json, sha256
 from loopcal.io.data.columns import COMMANDED, FIT, HELD_OUT, USE_COLUMN
 from loopcal.io.data.measurement_file import format_data_sheet, format_measurements
+from loopcal.io.robot.robot_file import list_shipped_robots
 from loopcal.measure.kinds.joints import Closure
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations
@@ -143,10 +144,15 @@ def _read_plan(sheet: Path) -> Mapping[str, Any]:
 
 
 def find_plan_robot(sheet: Path) -> tuple[str, bool]:
-    """Return the robot file of a plan, and whether it has changed since; FileError if unknown."""
+    """Return the robot file of a plan, the name of a shipped one, and whether it has changed since;
+    FileError if unknown.
+    """
     with open_bytes(sheet, "measurement file"):
         file = _read_plan(sheet).get("made_by", {}).get("inputs", {}).get("robot", {})
     path = str(file.get("path", ""))
+    shipped = list_shipped_robots().get(name := Path(path).stem)
+    if shipped is not None and sha256(shipped) == file.get("sha256"):
+        return name, False
     if not Path(path).is_file():
         sentence = "the plan of this sheet does not name its robot file"
         if path:
