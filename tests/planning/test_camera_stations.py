@@ -2,6 +2,7 @@
 """Where a camera stands: what is promised there is what simulated machines end with."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from loopcal.measure.instrument import Instrument
 from loopcal.measure.kinds.image import Image
 from loopcal.measure.simulation import sample_truth
 from loopcal.planning.camera_stations import choose_stations, list_stations
+from tests.zoo import load_cached_robot
 
 CALIPER = ((0.0, 3.6e-4),) * 2
 OPTIONS = lc.PlanOptions(n_poses=20, n_candidates=100)
@@ -23,6 +25,15 @@ def get_camera(instrument: Instrument) -> Image:
     kind = instrument.sensors[0].kind
     assert isinstance(kind, Image)
     return kind
+
+
+@cache
+def plan_pictures(name: str) -> tuple[Instrument, lc.Finding, lc.Plan]:
+    """Return the best station for a robot, what is said of it, and the plan of pictures there."""
+    robot = load_cached_robot(name)
+    camera = Image(corners=(4, 3), square=robot.size / 10.0)
+    instrument, (found,) = choose_stations(robot, camera, OPTIONS, CALIPER)
+    return instrument, found, lc.plan(robot, instrument, options=OPTIONS)
 
 
 def find_errors(robot: lc.Mechanism, instrument: Instrument, poses: np.ndarray) -> np.ndarray:
@@ -49,11 +60,10 @@ def find_errors(robot: lc.Mechanism, instrument: Instrument, poses: np.ndarray) 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["hexapod-42", "linear-delta"])
 def test_machines_end_with_the_promised_error(name):
-    robot = lc.load_robot(name)
-    camera = Image(corners=(4, 3), square=robot.size / 10.0)
-    instrument, (found,) = choose_stations(robot, camera, OPTIONS, CALIPER)
-    made = lc.plan(robot, instrument, options=OPTIONS)
-    errors = find_errors(robot, instrument, made.poses.coordinates[~made.poses.held_out])
+    instrument, found, made = plan_pictures(name)
+    errors = find_errors(
+        load_cached_robot(name), instrument, made.poses.coordinates[~made.poses.held_out]
+    )
     rms = float(np.sqrt((errors**2).mean()))
     # a root mean square over 12 machines of some directions each scatters by about 15 %
     assert rms == pytest.approx(made.errors.after.position_rms, rel=0.35)
@@ -64,7 +74,7 @@ def test_machines_end_with_the_promised_error(name):
 def test_square_pixels_give_a_board_that_never_turns_a_focal_length():
     """With another aspect for each camera, a third of such fits ended nowhere."""
     robot = lc.load_robot("five-bar")
-    instrument, _ = choose_stations(robot, Image(square=0.02), OPTIONS, CALIPER)
+    instrument, _ = choose_stations(robot, Image(corners=(4, 3), square=0.05), OPTIONS, CALIPER)
     poses = lc.sample_workspace(robot, 20, 1).coordinates
     for seed in (0, 1, 6):
         truth = robot.with_values(sample_truth(robot, 1, seed)[0])
@@ -78,15 +88,15 @@ def test_square_pixels_give_a_board_that_never_turns_a_focal_length():
 
 def test_delta_from_straight_above_would_end_with_a_larger_error():
     """A board that keeps its orientation shows the focal length only at an angle."""
-    robot = lc.load_robot("linear-delta")
-    instrument, _ = choose_stations(robot, Image(square=0.01), OPTIONS, CALIPER)
+    robot = load_cached_robot("linear-delta")
+    instrument, _, made = plan_pictures("linear-delta")
     (sensor,), poses = instrument.sensors, lc.sample_workspace(robot, 30, 1).solution
     steep = next(
         iter(list_stations(robot, get_camera(instrument), poses))
     )  # 10 deg from the normal
     other = replace(instrument, sensors=(replace(sensor, kind=steep),))
-    here, there = (lc.plan(robot, of, options=OPTIONS).errors.after for of in (instrument, other))
-    assert there.position_rms > 1.2 * here.position_rms
+    there = lc.plan(robot, other, options=OPTIONS)
+    assert there.errors.after.position_rms > 1.2 * made.errors.after.position_rms
 
 
 def test_every_station_shows_the_whole_board_from_its_front():

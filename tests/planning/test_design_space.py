@@ -117,6 +117,17 @@ def test_any_number_of_poses_is_enough_with_a_tolerance_prior():
     assert make_problem(draw_rows(), prior=True).require_enough(1) is None
 
 
+def test_corners_of_a_picture_are_exchanged_as_few_independent_rows():
+    """Twenty rows of rank three become three, and all designs have the scores of the twenty."""
+    rows = np.random.default_rng(3).normal(size=(12, 20, 3)) @ draw_rows(r=3, machine=30)
+    candidates = make_problem(rows).scale_candidates(11)
+    assert candidates.rows.shape == (12, 3, 30)
+    scaled = candidates.scoring.scale_rows(rows)
+    for chosen in (np.arange(11), np.arange(1, 12)):
+        of_all = candidates.scoring.score(candidates.scoring.factor(scaled[chosen]))
+        assert_allclose(candidates.scoring.score(candidates.factor(chosen)), of_all, rtol=CLOSE)
+
+
 every_case = pytest.mark.parametrize(("criterion", "nuisance", "prior"), CASES.values(), ids=CASES)
 
 

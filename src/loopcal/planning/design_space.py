@@ -26,6 +26,7 @@ from loopcal.typing import BoolArray, FloatArray, IntArray
 # A design is singular where it determines a direction with less than this share of the mean
 # design's information, as a ratio of standard deviations.
 SINGULAR = 1e-6
+MANY_ROWS = 12  # rows of a group that may have less rank: a pose alone has six
 
 
 def factor_rows(rows: FloatArray) -> FloatArray:
@@ -275,12 +276,18 @@ class DesignProblem:
         return Scoring(space, transform, factor_rows(prior.rows @ transform), prediction, offset)
 
     def scale_candidates(self, n: int) -> ScaledCandidates:
-        """Return the allowed groups scaled by the mean design of n of them."""
+        """Return the allowed groups scaled by the mean design of n of them; many rows of which at
+        most half are independent, such as corners of a picture, become as many as these.
+        """
         self.require_enough(n)
         scoring = self.build_scoring(n)
-        return ScaledCandidates(
-            self, scoring, scoring.scale_rows(self.rows[self.allowed]), self.allowed
-        )
+        rows = scoring.scale_rows(self.rows[self.allowed])
+        if rows.shape[1] >= MANY_ROWS:
+            _, s, directions = np.linalg.svd(rows, full_matrices=False)
+            rank = int(are_nonzero(s).sum(axis=1).max())
+            if 2 * rank <= rows.shape[1]:
+                rows = (s[:, :, None] * directions)[:, :rank]
+        return ScaledCandidates(self, scoring, rows, self.allowed)
 
 
 @dataclass(frozen=True, eq=False)
