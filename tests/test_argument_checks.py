@@ -1,6 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Arguments that would give a wrong result, or an error of numpy, are refused."""
 
+import contextlib
+import inspect
+import sys
+
 import numpy as np
 import pytest
 
@@ -95,6 +99,28 @@ def test_a_value_out_of_range_is_refused_with_what_is_allowed(call, words):
     ],
 )
 def test_robot_and_data_in_the_wrong_order_are_named(robot, data, tmp_path, call):
-    with pytest.raises(lc.DataError, match=r"robot: got a Measurements. Give Mechanism"):
+    with pytest.raises(lc.DataError, match=r"got a Me.*Give (Me|Id)"):
         call(robot, data, tmp_path)
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("wrong", [object(), "x.yaml", (), lc.Pose])
+@pytest.mark.parametrize(
+    "function", [f for name in lc.__all__ if inspect.isfunction(f := getattr(lc, name))]
+)
+def test_arguments_of_a_wrong_type_are_named_by_every_public_function(function, wrong) -> None:
+    needed = [p for p in inspect.signature(function).parameters.values() if p.default is p.empty]
+    given = [wrong for p in needed if p.kind is not p.KEYWORD_ONLY]
+    named = {p.name: wrong for p in needed if p.kind is p.KEYWORD_ONLY}
+    with contextlib.suppress(lc.LoopcalError):
+        function(*given, **named)
+
+
+def test_public_function_is_that_of_its_module_and_counts_its_arguments() -> None:
+    assert sys.modules[lc.calibrate.__module__].calibrate is lc.calibrate  # as pickle asks
+    with pytest.raises(TypeError, match="missing 1 required positional argument: 'data'"):
+        lc.calibrate(lc.load_robot("five-bar"))  # pyright: ignore
+    with pytest.raises(
+        lc.DataError, match=r"robot: got the text 'x.yaml'\. Give Mechanism, as from"
+    ):
+        lc.forward("x.yaml", [[1.0, 2.0]])  # pyright: ignore

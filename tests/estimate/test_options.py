@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import loopcal as lc
 from loopcal.errors import DataError, EstimationError
 from loopcal.estimate.descent import StepControl
 from loopcal.estimate.identification import identify, identify_trials
@@ -101,16 +102,16 @@ def test_method_and_loss_override_the_options() -> None:
     assert fit.options.noise == "estimated"
     assert options.method == MAP()
     with pytest.raises(DataError, match="Give FitOptions"):
-        identify(hexapod(), data, options={"noise": "given"})  # pyright: ignore[reportArgumentType]
+        lc.identify(hexapod(), data, options={"noise": "given"})  # pyright: ignore[reportArgumentType]
 
 
 def test_wrong_argument_type_is_refused_with_the_expected_type() -> None:
     with pytest.raises(DataError, match=r"robot: got the text 'hexapod-42'\. .*load_robot"):
-        identify("hexapod-42", hexapod_data())  # pyright: ignore[reportArgumentType]
+        lc.identify("hexapod-42", hexapod_data())  # pyright: ignore[reportArgumentType]
     with pytest.raises(DataError, match=r"data: got the text 'a.csv'\. .*load_measurements"):
-        identify(hexapod(), "a.csv")  # pyright: ignore[reportArgumentType]
-    with pytest.raises(DataError, match=r"trials: got a Measurements\. .*simulate_trials"):
-        identify_trials(hexapod(), hexapod_data())  # pyright: ignore[reportArgumentType]
+        lc.identify(hexapod(), "a.csv")  # pyright: ignore[reportArgumentType]
+    with pytest.raises(DataError, match=r"trials: got a Measurements\. Give Trials"):
+        lc.identify_trials(hexapod(), hexapod_data())  # pyright: ignore[reportArgumentType]
     with pytest.raises(DataError, match=r"prior: got the text 'run'\. .*prior_from"):
         FitOptions(prior="run")  # pyright: ignore[reportArgumentType]
     with pytest.raises(DataError, match=r"sequence of labels, such as \['12'\]"):

@@ -74,8 +74,7 @@ from loopcal.estimate.prior import refuse_reused_rows
 from loopcal.estimate.problem import problem_of
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, Severity, report_finding, sort_by_importance
-from loopcal.measure.array_checks import check_type
-from loopcal.measure.data_checks import check_duplicates, check_types
+from loopcal.measure.data_checks import check_duplicates
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import SEVERAL_DAYS, check_instruments
 from loopcal.measure.readings import fill_in_reading_sigma
@@ -139,8 +138,6 @@ def calibrate(
     <Verdict.CALIBRATED: 'calibrated'>
     """
     options = CalibrationOptions() if options is None else options
-    check_types(robot, data)
-    check_type(options, CalibrationOptions, "options", "such as CalibrationOptions(hold_out=0.25)")
     data = fix_undetermined_setup(robot, data)
     instruments = (name for name, *_ in list_instrument_frames(data))
     check_choice("frame", options.frame, (FITTED, BASE, RELATIVE, *instruments))

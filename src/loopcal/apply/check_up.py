@@ -35,7 +35,7 @@ from loopcal.estimate.fit_linearization import FitUncertainty
 from loopcal.estimate.recalibration import ErrorPart, JudgedChange, ParameterChanges, judge_change
 from loopcal.estimate.residual_test import DOUBT
 from loopcal.findings import Finding, report_finding
-from loopcal.measure.data_checks import check_actuators, check_types
+from loopcal.measure.data_checks import check_actuators
 from loopcal.measure.fitted_rows import FittedRows, collect_fitted_rows
 from loopcal.measure.kinds.kind import SCALES
 from loopcal.measure.measurements import Measurements
@@ -233,7 +233,6 @@ def _collect_rows(
 ) -> tuple[CheckRows, PoseErrors]:
     """Return the rows of a check, and its prediction errors."""
     robot = uncertainty.posterior.robot
-    check_types(robot, data)
     check_actuators(data, robot)
     table = data.nuisance_parameters.table
     # where an instrument stands, and its scale, are those of the check

@@ -47,7 +47,7 @@ from loopcal.estimate.residual_test import SIGMA_AS_STATED, NoiseKnowledge
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, Severity, report_finding
 from loopcal.findings.wording import list_names
-from loopcal.measure.data_checks import check_actuators, check_types
+from loopcal.measure.data_checks import check_actuators
 from loopcal.measure.fitted_rows import FittedRows
 from loopcal.measure.kinds.kind import SCALES
 from loopcal.measure.measurements import Measurements
@@ -316,8 +316,8 @@ def validate(
         uncertainty = collect_uncertainty(fit) if uncertainty is None else uncertainty
         noise = NoiseKnowledge.of(fit.residual_test)
         reused = [] if are_rows_known else _report_reused(fit.posterior.fitted_rows, data)
-    check_types(robot, data)
-    assert isinstance(robot, Mechanism)
+    if not isinstance(robot, Mechanism):
+        raise TypeError("fit is neither an identification nor a robot")
     check_actuators(data, robot)
     if nuisance_values_before is None:
         is_usual = before is None and nuisance_values is None and nuisance is not None

@@ -33,7 +33,7 @@ from loopcal.errors import DataError, EstimationError
 from loopcal.estimate import penalties
 from loopcal.estimate.fit_descent import sum_squares
 from loopcal.estimate.free_parameters import free_only, select_free_parameters
-from loopcal.estimate.identification import check_types, exclude_poses, identify
+from loopcal.estimate.identification import exclude_poses, identify
 from loopcal.estimate.information import collect_information
 from loopcal.estimate.observation_rows import linked_blocks
 from loopcal.estimate.options import FitOptions, merge_options
@@ -139,7 +139,6 @@ def cross_validate(
         `model.fold-not-converged`, with `must_converge`); or the options have nuisance parameters,
         which belong to all rows together.
     """
-    check_types(robot, data)
     options = merge_options(options, method)
     labels: list[str] = []
     before, after, scores, scores_before, converged = [], [], [], [], True
@@ -415,7 +414,6 @@ def choose_model(
     EstimationError : the stated sets are not nested. Sets with too few equations, and those that do
         not converge, are listed, but not compared.
     """
-    check_types(robot, data)
     sets = list_parameter_sets(robot) if nested is None else nested
     named = [(NOTHING, ()), *((name, tuple(names)) for name, names in sets.items())]
     for (small, inner), (large, outer) in pairwise(named):
@@ -566,7 +564,6 @@ def compute_regularization_curves(
     ------
     EstimationError, DataError : see `identify` and `cross_validate`.
     """
-    check_types(robot, data)
     options = merge_options(options)
     data = exclude_poses(fill_in_reading_sigma(robot, data), options.excluded_poses)
     poses = data.n_poses - len(set(options.excluded_poses))

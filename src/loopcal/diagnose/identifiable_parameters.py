@@ -38,7 +38,6 @@ from loopcal.estimate.prior_inflation import restate
 from loopcal.findings import Finding, report_finding
 from loopcal.findings.catalog.phrases import effect
 from loopcal.findings.wording import list_names, round_to_digits
-from loopcal.measure.array_checks import check_type
 from loopcal.measure.data_checks import check_actuators
 from loopcal.measure.instrument import SIGMA, Gaussian, Instrument, Sensor
 from loopcal.measure.kinds import KINDS
@@ -425,11 +424,6 @@ def suggest_measurements(
     sigma : standard deviations of the further instrument by dimension [SI].
     Returns one suggestion for each of `identifiability.unidentifiable`, in order.
     """
-    check_type(
-        identifiability, Identifiability, "identifiability", "as from identifiability(robot, data)"
-    )
-    if sigma is not None:
-        check_type(sigma, dict, "sigma", "such as {Dimension.LENGTH: 1e-5} [SI]")
     combinations, factor = identifiability.unidentifiable, identifiability.factor
     if not combinations:
         return ()
@@ -634,9 +628,6 @@ def choose_identifiable_subset(identifiability: Identifiability) -> Identifiable
     >>> len(subset.kept), int(subset.robot.parameters.free.sum())
     (10, 10)
     """
-    check_type(
-        identifiability, Identifiability, "identifiability", "as from identifiability(robot, data)"
-    )
     free, null = identifiability.free_parameters, identifiability.null_space()
     # of equal parameters the last one in the file is fixed
     places = choose_pivots((null * _weights(free)[:, None]).T, first=False)

@@ -39,7 +39,7 @@ from loopcal.estimate.problem import Problem, problem_of, problem_of_trials
 from loopcal.estimate.residual_test import FEWEST_DEGREES
 from loopcal.estimate.result import Identification
 from loopcal.measure.array_checks import check_type
-from loopcal.measure.data_checks import check_actuators, check_types
+from loopcal.measure.data_checks import check_actuators
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.readings import fill_in_reading_sigma, weight_reading_sigma
 from loopcal.measure.simulation import Trials
@@ -176,7 +176,6 @@ def identify(
         the start, or redundant readings that contradict each other so widely that the fit does not
         converge.
     """
-    check_types(robot, data)
     options = merge_options(options, method, loss)
     free = select_free_parameters(robot)
     default = LeastSquares() if options.prior is not None else None
@@ -365,8 +364,6 @@ def identify_trials(
     ------
     EstimationError : an option that is not supported, or no thread.
     """
-    check_type(robot, Mechanism, "robot", "as from load_robot('hexapod-42')")
-    check_type(trials, Trials, "trials", "as from simulate_trials(...)")
     check_threads(threads)
     if not len(trials):
         raise EstimationError("the set of trials is empty. Simulate at least one machine")

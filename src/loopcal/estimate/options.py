@@ -267,7 +267,6 @@ def merge_options(
     """Return options in which a method and a loss that are not None replace those of `options`."""
     if options is None:
         return FitOptions(method=method, loss=loss)
-    check_type(options, FitOptions, "options", "such as FitOptions(noise='estimated')")
     shortcuts = {"method": method, "loss": loss}
     stated = {name: value for name, value in shortcuts.items() if value is not None}
     return dataclasses.replace(options, **stated) if stated else options

@@ -22,7 +22,6 @@ from loopcal.errors import DataError, EstimationError, suggest_names
 from loopcal.estimate.linearization import Linearization, Start
 from loopcal.estimate.posterior import Posterior
 from loopcal.estimate.problem import Problem
-from loopcal.measure.array_checks import check_type
 from loopcal.measure.fitted_rows import FittedRows
 from loopcal.measure.measurements import Measurements
 from loopcal.mechanism.model import Mechanism
@@ -172,7 +171,6 @@ def prior_from(earlier: Posterior) -> Prior:
     ------
     EstimationError : the earlier calibration has no intervals.
     """
-    check_type(earlier, Posterior, "earlier", "as identify(robot, data).posterior")
     if np.isnan(earlier.variance).any():
         raise EstimationError.of("prior.no-uncertainty")
     known = np.isfinite(earlier.variance)

@@ -25,7 +25,6 @@ from loopcal.estimate.prior import limb_parameters, prior_from
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
 from loopcal.findings.catalog.phrases import MACHINE
-from loopcal.measure.data_checks import check_types
 from loopcal.measure.instrument import make_random_stream
 from loopcal.measure.measurements import Measurements
 from loopcal.mechanism.model import Mechanism
@@ -102,7 +101,6 @@ def recalibrate(
     EstimationError : an unknown limb, other parameters, an earlier calibration without uncertainty,
         or options with another method, a loss or a prior.
     """
-    check_types(robot, data)
     options = merge_options(options)
     if options.method is not None and not isinstance(options.method, LeastSquares):
         raise EstimationError(

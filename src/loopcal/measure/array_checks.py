@@ -2,12 +2,25 @@
 """Checks of arrays that measurements and kinds store: float64, read-only, of a stated shape."""
 
 from collections.abc import Callable, Iterable, Sequence
+from functools import wraps
+from inspect import signature
+from numbers import Integral, Real
+from types import ModuleType, NoneType, UnionType
+from typing import Any, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from loopcal.errors import DataError
 from loopcal.typing import BoolArray, FloatArray, IntArray
+
+WIDE: dict[type, Any] = {float: Real, int: Integral, np.ndarray: (np.ndarray, Sequence)}
+"""What is also accepted for a class of an annotation."""
+SOURCES = {
+    "Mechanism": ", as from loopcal.load_robot('hexapod-42')",
+    "Measurements": ", as from load_measurements('data.csv', robot)",
+}
+"""How to obtain an instance of a class."""
 
 
 def check_array(
@@ -119,9 +132,41 @@ def check_names(names: str | Iterable[str], what: str) -> tuple[str, ...]:
 
 def check_type(value: object, wanted: type, what: str, hint: str) -> None:
     """Raise a DataError that calls an argument `what`, and says how to obtain one of the class."""
-    accepted = (float, int) if wanted is float else wanted
-    if not isinstance(value, accepted):
+    if not isinstance(value, wanted):
         raise DataError(f"{what}: got {describe(value)}. Give {wanted.__name__}, {hint}")
+
+
+def name_wrong_arguments(function: Callable[..., Any], package: ModuleType) -> Callable[..., Any]:
+    """Return a function whose calls that fail raise a DataError for the first argument that is not
+    of the type of its annotation, with names from the package. Other calls take no longer.
+    """
+
+    @wraps(function)
+    def call(*given: Any, **named: Any) -> Any:
+        try:
+            return function(*given, **named)
+        except (AttributeError, LookupError, TypeError, ValueError) as error:
+            if error.__traceback__ is None or error.__traceback__.tb_next is None:
+                raise  # the number of arguments is wrong
+            names = {
+                name: getattr(package, name) for name in ("Run", "CalibrationReport", "Format")
+            }
+            hints = get_type_hints(function, localns=names)
+            for name, value in signature(function).bind(*given, **named).arguments.items():
+                _refuse_wrong_type(name, value, hints.get(name))
+            raise
+
+    return call
+
+
+def _refuse_wrong_type(name: str, value: object, hint: Any) -> None:
+    parts = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
+    classes = [get_origin(part) or part for part in parts]
+    if any(not isinstance(each, type) or hasattr(each, "_is_protocol") for each in classes):
+        return
+    if not isinstance(value, tuple(WIDE.get(each, each) for each in classes)):
+        words = [c.__name__ + SOURCES.get(c.__name__, "") for c in classes if c is not NoneType]
+        raise DataError(f"{name}: got {describe(value)}. Give {' or '.join(words)}") from None
 
 
 def check_seed(seed: int) -> None:

@@ -15,7 +15,6 @@ import numpy as np
 
 from loopcal import geometry
 from loopcal.errors import DataError
-from loopcal.measure.array_checks import check_type
 from loopcal.measure.kinds import CLOSURE
 from loopcal.measure.kinds.joints import JointSensor
 from loopcal.measure.kinds.kind import Kind
@@ -79,15 +78,8 @@ def check_kinds(robot: Mechanism, kinds: Sequence[Kind]) -> None:
                 )
 
 
-def check_types(robot: object, data: object) -> None:
-    """Refuse anything but a robot and measurements, such as file names."""
-    check_type(robot, Mechanism, "robot", "as from loopcal.load_robot('hexapod-42')")
-    check_type(data, Measurements, "data", "as from load_measurements('data.csv', robot)")
-
-
 def check_actuators(measurements: Measurements, robot: Mechanism) -> None:
-    """Refuse other types, not one reading per actuator, and readings without information."""
-    check_types(robot, measurements)
+    """Refuse not one reading per actuator, and readings without information."""
     columns, names = measurements.readings.shape[1], tuple(a.name for a in robot.actuators)
     if columns != len(names):
         stated: dict[str, Any] = {"columns": columns, "robot": robot.name}

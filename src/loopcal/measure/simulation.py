@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 
 from loopcal.engine import State
 from loopcal.errors import DataError
-from loopcal.measure.array_checks import check_array, check_type, refuse_first
+from loopcal.measure.array_checks import check_array, refuse_first
 from loopcal.measure.data_checks import check_closure, check_kinds
 from loopcal.measure.initial_values import EvaluatedRows, evaluate_measurements
 from loopcal.measure.instrument import Distribution, Instrument, Seed, make_random_stream
@@ -225,7 +225,6 @@ def sample_truth(
     ------
     MechanismError : the robot is over-constrained, so that its loops do not close with such errors.
     """
-    check_type(robot, Mechanism, "robot", "from loopcal.load_robot")
     refuse_breaking_parameters(robot, drawn=True)
     if distribution not in get_args(Distribution):
         raise DataError(f"distribution is {distribution!r}. Give 'normal' or 'uniform'")
@@ -276,8 +275,6 @@ def simulate_trials(
     ------
     DataError : a pose out of reach, an unknown setup parameter, or another shape of `truth`.
     """
-    check_type(robot, Mechanism, "robot", "from loopcal.load_robot")
-    check_type(instrument, Instrument, "instrument", "such as loopcal.Instrument((sensor,))")
     kinds = [sensor.kind for sensor in instrument.sensors]
     check_kinds(robot, kinds)
     values = check_array(np.atleast_2d(np.asarray(truth)), "truth", (None, len(robot.parameters)))
@@ -397,7 +394,6 @@ def simulate(
     ------
     DataError : the controller or the true machine does not reach a pose.
     """
-    check_type(robot, Mechanism, "robot", "from loopcal.load_robot")
     how = (controller, nuisance_values, reading_sigma, NO_DISTURBANCE, pose_names)
     trials = simulate_trials(robot, robot.values[None], poses, instrument, seed, *how)
     failed = ~trials.reached[0]

@@ -27,7 +27,6 @@ from loopcal.estimate.free_parameters import FreeParameters, select_free_paramet
 from loopcal.estimate.posterior import SAME_MOTION
 from loopcal.estimate.problem import problem_of
 from loopcal.findings import Finding, Quantity, report_finding
-from loopcal.measure.array_checks import check_type
 from loopcal.measure.data_checks import check_actuators, check_closure
 from loopcal.measure.instrument import Instrument
 from loopcal.measure.measurements import Measurements
@@ -295,9 +294,7 @@ def prepare_problem(
     own limits, wherever the constraints allow measuring. With allowed poses in the options, they
     are predicted for as many of these, drawn at random.
     """
-    check_type(instrument, Instrument, "instrument", "such as Instrument((sensor,))")
     options = options or PlanOptions()
-    check_type(options, PlanOptions, "options", "such as PlanOptions(n_poses=30)")
     free = select_free_parameters(robot)
     if not len(free):
         raise EstimationError.of("plan.no-free-parameter", robot=robot.name)

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+import loopcal as lc
 from loopcal import geometry
 from loopcal.diagnose.identifiable_parameters import identifiability
 from loopcal.errors import DataError, LoopcalError
@@ -20,7 +21,7 @@ from loopcal.measure.kinds.position import Bearing, Position
 from loopcal.measure.kinds.surfaces import Line, Plane, Sphere
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations
-from loopcal.measure.simulation import sample_truth, simulate
+from loopcal.measure.simulation import simulate
 from tests import zoo
 from tests.findings.expectations import expect_refusal
 
@@ -211,11 +212,11 @@ REFUSED = {
     "noise: got a float. Give Noise, such as": (
         lambda: Sensor(POSE, 1e-5)  # type: ignore[arg-type]
     ),
-    "robot: got the text 'hexapod-42'. Give Mechanism, from loopcal.load_robot": (
-        lambda: sample_truth("hexapod-42", 1, 0)  # type: ignore[arg-type]
+    "robot: got the text 'hexapod-42'. Give Mechanism, as from loopcal.load_robot": (
+        lambda: lc.sample_truth("hexapod-42", 1, 0)  # type: ignore[arg-type]
     ),
     "instrument: got the text 'pose'. Give Instrument": (
-        lambda: simulate(zoo.hexapod(), POSES, "pose", 1)  # type: ignore[arg-type]
+        lambda: lc.simulate(zoo.hexapod(), POSES, "pose", 1)  # type: ignore[arg-type]
     ),
     "got the text '1 um'. Give an array": lambda: Gaussian("1 um"),  # type: ignore[arg-type]
 }

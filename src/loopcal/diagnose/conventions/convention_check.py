@@ -126,7 +126,6 @@ def check_conventions(
     ------
     DataError : with the files of the data and the evidence; its code is that of the finding.
     """
-    data_checks.check_types(robot, data)
     try:
         if not allow_still and data_checks.has_static_targets(data):
             solution = forward(robot, data.readings)
@@ -161,7 +160,6 @@ def compare_conventions(robot: Mechanism, data: Measurements) -> ConventionCheck
     ------
     DataError : the readings have another number of actuators.
     """
-    data_checks.check_types(robot, data)
     data_checks.check_actuators(data, robot)
     data = replace(data, base_observations=())
     robot = fix_breaking_parameters(robot)  # no data contain other values of them

@@ -72,7 +72,7 @@ from loopcal.io.data.kind_settings import (
     read_stated_values,
 )
 from loopcal.io.robot.robot_file import check_format, list_shipped_robots, load_robot
-from loopcal.measure.data_checks import check_duplicates, check_kinds, check_strokes, check_types
+from loopcal.measure.data_checks import check_duplicates, check_kinds, check_strokes
 from loopcal.measure.instrument import Gaussian, Instrument, Sensor
 from loopcal.measure.kinds.kind import Kind
 from loopcal.measure.measurements import Measurements, list_moving_targets
@@ -754,7 +754,6 @@ def save_measurements(
     DataError : a name that a file cannot hold.
     """
     path = as_path(path, "measurement file")
-    check_types(robot, data)
     text = format_measurements(data, robot, remark)
     refuse_settings_beside(path)
     write_text(path, text)
