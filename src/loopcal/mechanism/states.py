@@ -60,8 +60,12 @@ def list_bodies(state: State) -> list[FloatArray]:
 
 
 def select_poses(state: State, rows: np.ndarray) -> State:
-    """Return poses `rows` (positions or a mask) of a state (t, n), all trials."""
-    return map_arrays(lambda a: a[:, rows], state)
+    """Return poses `rows` (positions or a mask) of a state (t, n), all trials; it itself if these
+    are all.
+    """
+    everywhere = True if rows.dtype == np.bool_ else np.arange(len(rows))
+    is_whole = len(rows) == state.T.shape[1] and bool((rows == everywhere).all())
+    return state if is_whole else map_arrays(lambda a: a[:, rows], state)
 
 
 def without_poses(state: State, trials: int) -> State:
