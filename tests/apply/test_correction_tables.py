@@ -72,6 +72,13 @@ def test_four_times_the_accuracy_takes_twice_the_intervals() -> None:
     assert ((ratios > 1.6) & (ratios < 2.5)).all()
 
 
+def test_errors_of_straight_axes_remain_as_zero_not_as_rounding() -> None:
+    robot = lc.load_robot("core-xy")
+    found = make_tables(disturb(robot), robot, GRID, 1e-6)[1]
+    assert found.data["after"].value == 0.0
+    assert " to 0 mm, at " in str(found)
+
+
 def test_a_table_that_is_too_small_says_so() -> None:
     robot = lc.load_robot("linear-delta")
     small = TableSize("height", 30, 8)

@@ -584,7 +584,8 @@ def _report(
     """Return how large errors were, what remains, and what no table of this sort corrects."""
     robot, others = machine.robot, tuple(set(range(misses[0].shape[1])) - {*machine.corrected})
     is_met = machine.weigh(misses[1]) <= limit
-    sizes = [machine.measure(rows, machine.corrected) for rows in misses]
+    measured = (machine.measure(rows, machine.corrected) for rows in misses)
+    sizes = [(p * (p > ROUNDING * robot.size), a * (a > ROUNDING)) for p, a in measured]
     sizes.append((limit, limit / robot.size if sizes[0][1] else 0.0))
     data: dict[str, Any] = {"what": size.what, "points": len(misses[1]), "is_met": is_met}
     data["nodes"] = [" x ".join(str(len(n)) for n in t.axes.values()) for t in tables if t.axes]
