@@ -394,7 +394,10 @@ def test_work_is_stopped_and_another_waits(start) -> None:
     assert not [child for child in children if child.is_running()]
     assert server.tell("/stop") == ""
     assert server.tell("/calibrate") == ""
-    assert "42 parameters" in server.wait()["pages"]["calibrate"]
+    while "calibrate" not in (state := server.state)["pages"] and state["progress"] is not None:
+        time.sleep(0.1)
+    assert "42 parameters" in state["pages"]["calibrate"]
+    assert server.tell("/stop") == ""  # no report is read
 
 
 def run_script(project: Project, script: Path, text: str, stop_after: float = 60) -> None:

@@ -65,19 +65,17 @@ def photographed(tmp_path_factory) -> Path:
 def calibrated(photographed, loopcal, monkeypatch) -> lc.Run:
     """Go to the folder, and return the calibration by its pictures, made once for all tests."""
     monkeypatch.chdir(photographed)
-    if not Path("plain").exists():
-        loopcal("photos pictures --board board.yaml --poses poses.csv -o plain.csv")
-        loopcal("calibrate hexapod-42 plain.csv -o plain", code=(0, 2))
-    return lc.load_run("plain")
+    if not Path("run").exists():
+        loopcal("photos pictures --board board.yaml --poses poses.csv -o points.csv")
+        loopcal("calibrate hexapod-42 points.csv -o run", code=(0, 2))
+    return lc.load_run("run")
 
 
 @pytest.mark.slow
-def test_photos_become_a_measurement_file_that_calibrates(
-    photographed, loopcal, monkeypatch
-) -> None:
-    monkeypatch.chdir(photographed)
+def test_photos_become_a_measurement_file_that_calibrates(calibrated, loopcal) -> None:
     words = "photos pictures --board board.yaml --poses poses.csv -o points.csv"
-    printed = loopcal(words, "p0.png: left out: it shows 0 corners", "blur 0.9 px")
+    text, fitted = Path("points.csv").read_bytes(), calibrated.arrays["residual_0_image"]
+    printed = loopcal(f"{words} --force", "p0.png: left out: it shows 0 corners", "blur 0.9 px")
     assert "points.csv: 8 of 9 pictures" in printed.out
     robot = lc.load_robot("hexapod-42")
     data = lc.load_measurements("points.csv", robot)
@@ -86,10 +84,8 @@ def test_photos_become_a_measurement_file_that_calibrates(
     assert rows.kind.corners == (5, 4)
     page = Path("points.html").read_text("utf-8")
     assert page.count("data:image/jpeg") == 9
-    loopcal("calibrate hexapod-42 points.csv -o run", code=(0, 2))
-    fit = lc.load_run("run").result["fit"]
+    fit = calibrated.result["fit"]
     assert fit["chi_square"] / fit["degrees"] < 1.0  # corners are better than the assumed 0.1 px
-    text, fitted = Path("points.csv").read_bytes(), lc.load_run("run").arrays["residual_0_image"]
     loopcal(f"{words} --residuals run", "--force", code=1)
     loopcal(f"{words} --residuals run --force")
     page = Path("points.html").read_text("utf-8")

@@ -55,7 +55,9 @@ def list_names() -> Iterator[tuple[str, str, ast.AST]]:
 def list_openings() -> Iterator[str]:
     """Yield the modules that open a file with a mode that writes."""
     for module, call in parse_source():
-        if isinstance(call, ast.Call) and ast.unparse(call.func).rpartition(".")[2] == "open":
+        function = getattr(call, "func", None)
+        name = getattr(function, "attr", getattr(function, "id", ""))
+        if isinstance(call, ast.Call) and name == "open":
             words = [*call.args, *(keyword.value for keyword in call.keywords)]
             modes = [word.value for word in words if isinstance(word, ast.Constant)]
             if any(re.fullmatch(r"[wax][bt+]*|r.?\+", str(mode)) for mode in modes):
