@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import combinations
+from itertools import combinations, compress
 
 import numpy as np
 
@@ -22,6 +22,7 @@ from loopcal.errors import MechanismError
 from loopcal.findings import Quantity, report_finding
 from loopcal.mechanism.joint_graph.graph import GraphJoint, turn_between
 from loopcal.numerics.decomposition import find_null_space
+from loopcal.numerics.elimination import find_connected_groups
 from loopcal.typing import BoolArray, FloatArray
 
 # Singular value of the scaled closures, relative to the largest, that counts as zero [1].
@@ -126,6 +127,13 @@ class JointGraph:
         return np.where(self.turns, 1.0, self.size)
 
     @cached_property
+    def limits(self) -> tuple[FloatArray, FloatArray]:
+        """Lowest and highest values of the joints of the tree (j,) [rad, m]."""
+        limits = [joint.limits or (-np.inf, np.inf) for joint in self.tree]
+        low, high = np.array(limits, dtype=float).reshape(-1, 2).T
+        return low, high
+
+    @cached_property
     def _index(self) -> Mapping[str, int]:
         return {body: i for i, body in enumerate(self.bodies)}
 
@@ -137,6 +145,10 @@ class JointGraph:
             below[i + 1] = below[self._index[joint.body_a]]
             below[i + 1, i] = True
         return below
+
+    def find_carriers(self, body: str) -> BoolArray:
+        """Return which joints (j,) of the tree move a body."""
+        return self._is_below[self._index[body]]
 
     def place(self, q: FloatArray) -> Placement:
         """Return the places of all bodies and joints at joint values (n, j)."""
@@ -180,7 +192,7 @@ class JointGraph:
         arms = np.cross(placement.axes, point[:, None] - placement.points)
         turns = self.turns[:, None]
         parts = np.where(turns, placement.axes, 0.0), np.where(turns, arms, placement.axes)
-        twists = np.concatenate(parts, axis=2) * self._is_below[self._index[body]][:, None]
+        twists = np.concatenate(parts, axis=2) * self.find_carriers(body)[:, None]
         return twists.swapaxes(1, 2)
 
     def linearize(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -223,10 +235,13 @@ class JointGraph:
         residual, jacobian = (np.concatenate(arrays, axis=1) for arrays in zip(*parts, strict=True))
         return residual, jacobian
 
-    def close(self, starts: FloatArray, fixed: BoolArray | None = None) -> FloatArray:
+    def close(
+        self, starts: FloatArray, fixed: BoolArray | None = None, gap: float = CLOSED
+    ) -> FloatArray:
         """Close the loops by Newton's method from joint values (n, j); NaN where it diverges.
 
-        `fixed` (j,) are joints that keep their values. Steps are of least norm.
+        `fixed` (j,) are joints that keep their values. Steps are of least norm. gap : largest
+        residual of closed loops.
         """
         q, is_closed = starts.copy(), np.zeros(len(starts), dtype=bool)
         free = np.ones(len(self.tree), dtype=bool) if fixed is None else ~fixed
@@ -235,7 +250,7 @@ class JointGraph:
             if not left.size:
                 break
             residual, step = self._propose(q[left], free, CLOSURE_RANK_TOLERANCE, LARGEST_STEP)
-            is_closed[left] = np.abs(residual).max(axis=1, initial=0.0) < CLOSED
+            is_closed[left] = np.abs(residual).max(axis=1, initial=0.0) < gap
             active = ~is_closed[left]
             q[left[active]] += step[active]
         q[~is_closed] = np.nan
@@ -317,25 +332,60 @@ def find_homes(graph: JointGraph) -> tuple[list[FloatArray], bool]:
     first, without poses of larger mobility, and whether the first is the pose that all joints have
     at zero, or at a limit near it; raises MechanismError where the loops do not close.
     """
-    limits = [joint.limits or (-np.inf, np.inf) for joint in graph.tree]
-    low, high = np.array(limits, dtype=float).reshape(-1, 2).T
-    rest = np.clip(np.zeros(len(low)), low, high)
-    spreads = [0.0, *[SPREAD] * (STARTS - 1)]  # of the starts from zero: the first is there
-    drawn = [np.random.default_rng(i).uniform(-s, s, len(rest)) for i, s in enumerate(spreads)]
-    starts = np.stack([rest + shift * graph.units for shift in drawn])
+    starts = _draw_starts(graph)
     closed = graph.close(starts)
     closed = closed[np.isfinite(closed).all(axis=1)]
     if not len(closed):
-        raise MechanismError(_describe_gap(graph, starts))
+        closed = _close_groups(graph, starts)
     mobilities = np.array([graph.find_motions(q).shape[1] for q in closed])
-    regular = closed[mobilities == mobilities.min()]
-    is_outside = ((regular < low - SAME) | (regular > high + SAME)).any(axis=1)
-    distance = (((regular - rest) / graph.units) ** 2).sum(axis=1)
     homes: list[FloatArray] = []
-    for q in regular[np.lexsort((distance, is_outside))]:
+    for q in _sort_poses(graph, closed[mobilities == mobilities.min()], starts[0]):
         if all(np.abs((q - other) / graph.units).max(initial=0.0) > SAME for other in homes):
             homes.append(q)
-    return homes, bool(np.abs((homes[0] - rest) / graph.units).max(initial=0.0) < DRAWN)
+    return homes, bool(np.abs((homes[0] - starts[0]) / graph.units).max(initial=0.0) < DRAWN)
+
+
+def _draw_starts(graph: JointGraph) -> FloatArray:
+    """Return joint values (n, j) near zero, or limits near it; the first are there."""
+    low, high = graph.limits
+    drawn = [np.random.default_rng(i).uniform(-SPREAD, SPREAD, len(low)) for i in range(STARTS)]
+    drawn[0] *= 0.0
+    return np.clip(np.zeros(len(low)), low, high) + np.stack(drawn) * graph.units
+
+
+def _sort_poses(graph: JointGraph, q: FloatArray, rest: FloatArray) -> FloatArray:
+    """Return poses (n, j), those within their limits and nearest to rest (j,) first."""
+    low, high = graph.limits
+    is_outside = ((q < low - SAME) | (q > high + SAME)).any(axis=1)
+    return q[np.lexsort(((((q - rest) / graph.units) ** 2).sum(axis=1), is_outside))]
+
+
+def _close_groups(
+    graph: JointGraph, starts: FloatArray, gap: float = CLOSED, holds_motors: bool = False
+) -> FloatArray:
+    """Return joint values (1, j) that close the loops within a gap. Loops that share no joint close
+    one group after the other, and if a motor joins them with the motors as in the first of starts
+    (n, j): one start seldom closes all legs of a machine. Refuse loops that no start closes.
+    """
+    moves = np.array([np.logical_xor(*map(graph.find_carriers, j.bodies)) for j in graph.closing])
+    links = np.argwhere(moves & ~(graph.is_driven & holds_motors)) + np.array([0, len(moves)])
+    groups = find_connected_groups(links, len(moves) + len(graph.tree))
+    q = starts[0]
+    for group in dict.fromkeys(groups[: len(moves)]):
+        part = replace(graph, closing=tuple(compress(graph.closing, groups == group)))
+        is_free = groups[len(moves) :] == group
+        tries = np.where(is_free, starts, q)
+        closed = part.close(tries, ~is_free, gap)
+        closed = closed[np.isfinite(closed).all(axis=1)]
+        if not len(closed):
+            if holds_motors:
+                raise MechanismError(_describe_gap(part, tries))
+            try:
+                closed = _close_groups(part, tries, gap, holds_motors=True)
+            except MechanismError:
+                raise MechanismError(_describe_gap(part, tries)) from None
+        q = _sort_poses(graph, closed, starts[0])[0]
+    return q[None]
 
 
 def find_freedoms(graph: JointGraph, q: FloatArray, platform: str) -> Freedoms:
@@ -456,7 +506,13 @@ def repair_rounded_loops(graph: JointGraph, rounding: tuple[float, float]) -> Re
         return unchanged
     q = graph.approach(start)[0]
     if np.abs(graph.linearize(q[None])[0]).max(initial=0.0) > limit:
-        return unchanged
+        starts = _draw_starts(graph)
+        try:
+            if np.isfinite(graph.close(starts)).any():
+                return unchanged
+            q = graph.approach(_close_groups(graph, starts, limit))[0]
+        except MechanismError:
+            return unchanged
     repaired, turn = _align_axes(graph, q, limit)
     if not np.isfinite(repaired.close(q[None])).all():  # with too many motors it cannot move either
         return unchanged

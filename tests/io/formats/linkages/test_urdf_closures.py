@@ -347,3 +347,35 @@ def test_rigid_closure_at_a_pin_is_named_with_what_to_write_instead(tmp_path, pl
         robot = read(tmp_path, text, closures.replace("6d", "3d"), platform)[1]
         q = inverse(robot, robot.home[None]).q
         assert forward(robot, q + 0.05).converged.all()
+
+
+@pytest.mark.slow
+def test_legs_of_one_crank_close_one_after_the_other(tmp_path) -> None:
+    """24 four-bars on a crank, drawn open and stretched: no start closes all of them."""
+    crank, rod, rocker, base, count = 0.15, 0.5, 0.28, 0.38, 24
+    parts = [
+        '<link name="base"/><link name="crank"/>',
+        make_joint("axle", "base", "crank", "0 0 0"),
+    ]
+    angles = 2 * np.pi * np.arange(count) / count
+    for i, angle in enumerate(angles):
+        x, y = base * np.cos(angle), base * np.sin(angle)
+        parts += [f'<link name="rod{i}"/><link name="rocker{i}"/>']
+        parts += [make_joint(f"knee{i}", "crank", f"rod{i}", f"{crank} 0 0")]
+        parts += [make_joint(f"hip{i}", "base", f"rocker{i}", f"{x} {y} 0")]
+        pin = PIN.replace("pin", f"pin{i}").replace("rod2", f"rocker{i}").replace("rod1", f"rod{i}")
+        pin = pin.replace('parent_origin xyz="0.3', f'parent_origin xyz="{rod}')
+        parts += [pin.replace('child_origin xyz="0.3', f'child_origin xyz="{rocker}')]
+    motor = '<transmission name="t"><joint name="axle"/></transmission>'
+    text = f'<robot name="walker">{"".join(parts)}{motor}</robot>'
+    robot = read(tmp_path, text, platform="rod3")[1]
+    T = forward(robot, np.linspace(-0.2, 0.2, 5)[:, None]).T
+    knee = T[:, :3, 3] + rod * T[:, :3, 0]
+    hip = base * np.array([np.cos(angles[3]), np.sin(angles[3]), 0.0])
+    turn = np.arctan2(T[:, 1, 3], T[:, 0, 3])
+    np.testing.assert_allclose(turn - turn[2], np.linspace(-0.2, 0.2, 5), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(T[:, :3, 3], axis=1), crank, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(knee - hip, axis=1), rocker, rtol=0, atol=1e-12)
+    long = text.replace(f'child_origin xyz="{rocker} 0 0"', 'child_origin xyz="1 0 0"', 1)
+    with pytest.raises(LoopcalError, match=r"closure 'pin0', .* stays"):  # not of another leg
+        read(tmp_path, long, platform="rod3")

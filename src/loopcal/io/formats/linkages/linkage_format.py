@@ -608,7 +608,7 @@ def _describe_limbs(mechanism: Linkage, paths: ClosedStage) -> Content:
     inner = _make_unique(links, (BASE, PLATFORM))
     bodies = dict(zip(paths.bodies, inner, strict=True))
     homes = [
-        {"name": name, "home": describe_pose(graph.locate(home, body))}
+        {"name": name, "home": {"x": 0.0}, **_describe_moved("home", graph.locate(home, body))}
         for body, name in bodies.items()
     ]
     bodies |= {graph.base: BASE, paths.platform: PLATFORM}
@@ -625,7 +625,7 @@ def _describe_limbs(mechanism: Linkage, paths: ClosedStage) -> Content:
         **({"bodies": homes} if homes else {}),
         "limbs": [limb for limb, _ in limbs],
         **({"parameters": parameters} if parameters else {}),
-        "home": describe_pose(graph.locate(home, paths.platform) @ paths.frame),
+        **_describe_moved("home", graph.locate(home, paths.platform) @ paths.frame),
     }
 
 
