@@ -266,17 +266,18 @@ def _compute_margins(
     for i, (A, is_known) in loops.items():
         block = robot.blocks[i].robot
         _, s, V = np.linalg.svd(A)
-        least, twist, freedoms = s[:, -1], np.zeros((n, 6)), list(block.program.freedoms)
+        least, twist = np.where(is_known, s[:, -1], np.nan), np.zeros((n, 6))
+        freedoms = list(block.program.freedoms)
         twist[:, freedoms] = V[:, s.shape[1] - 1] / block.twist_scale[freedoms]
         twist = np.matmul(transports[i], twist[..., None])[..., 0] * robot.twist_scale
         length = np.linalg.norm(twist, axis=1, keepdims=True)
-        is_less = ~(margin <= np.where(is_known, least, np.nan))
-        margin = np.where(is_less, np.where(is_known, least, np.nan), margin)
+        is_less = ~(margin <= least)
+        margin = np.where(is_less, least, margin)
         direction = np.where(is_less[:, None], twist / np.maximum(length, 1e-300), direction)
     _, r, W = np.linalg.svd(slope)
     weakest = moving[np.abs(W[:, r.shape[1] - 1]).argmax(axis=1)]
-    direction = direction[:, list(robot.program.freedoms)]
-    return margin, direction, np.where(good, r[:, -1], np.nan), weakest
+    own = direction[:, list(robot.program.freedoms)]
+    return margin, own, np.where(good, r[:, -1], np.nan), weakest
 
 
 Matrix = tuple[FloatArray, BoolArray]
