@@ -12,6 +12,7 @@ from loopcal import geometry
 from loopcal.apply.accuracy import pose_uncertainty
 from loopcal.apply.error_budget import ErrorBudget, compute_error_budget
 from loopcal.diagnose.error_frames import solve_home
+from loopcal.estimate.fit_linearization import linearize_fit
 from loopcal.estimate.identification import identify, identify_trials
 from loopcal.estimate.options import FitOptions
 from loopcal.estimate.penalties import MAP, LeastSquares
@@ -231,6 +232,28 @@ def test_without_noise_what_few_poses_do_not_determine_keeps_its_tolerance(metho
     for sources, error in zip((budget.position, budget.orientation), true, strict=True):
         assert sources.rms == pytest.approx(error, rel=AGREEMENT)
         assert sources.tolerances > 0.999 * sum(sources)
+
+
+def test_start_values_that_rows_do_not_change_have_no_part_in_the_budget():
+    """Of a position of 3.5 um, the instrument had 1.9 or 2.1 um; without start values it is 3.0."""
+    machine = lc.load_robot("five-bar")
+    places = np.array([[0.1, 0.0, 0.02], [-0.05, 0.08, 0.02]])
+    station = geometry.make_pose(geometry.exp_so3(np.array([0.1, -0.2, 0.7])), np.ones(3))
+    unknown = ("frame", "targets")
+    kind = Position(targets=("a", "b"), places=places, T_base_frame=station, unknown=unknown)
+    session = np.repeat(["first", "second"], 12)
+    sensor = Sensor(kind, Gaussian(np.full(6, 10 * UM)), session=session)
+    commanded = sample_workspace(machine, 24, 0).coordinates
+    data = simulate(machine, commanded, Instrument((sensor,)), 0)
+    fit = identify(machine, data)
+    setup = linearize_fit(fit, data).linearization.nuisance
+    assert setup is not None
+    null, first = setup.elimination.null_directions(), find_budget(fit, data)
+    assert null.shape[1] == 6  # both frames may move with their targets along any axis
+    for change in np.random.default_rng(5).normal(0.0, 0.1, (2, 6)):
+        moved = replace(fit.nuisance, estimate=fit.nuisance.estimate + null @ change)
+        other = find_budget(replace(fit, nuisance=moved), data)
+        np.testing.assert_allclose(other.position, first.position, rtol=1e-5)
 
 
 def test_readings_of_a_known_machine_leave_their_repeatability():

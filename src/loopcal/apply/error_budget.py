@@ -404,7 +404,8 @@ def _separate_setup(
     and would seem to be errors of these. is_setup : (U,) parameters that are no such errors.
     noise : factor on the stated sigmas of rows.
 
-    The setup parameters move by W = D + S e, with D in blocks, one for each cluster. With
+    The setup parameters move by W = D + S e, with D in blocks, one for each cluster, along what
+    rows determine of them: start values decide the rest, and errors cannot depend on these. With
     D = V s Q', the rows of W are spanned by Q' + (V'S / s) e = Q' + H e, and by N e where s is
     zero. With y = e Q and e - y Q' = F Z, a vector Q a + Z' b is without part in these rows if
 
@@ -412,7 +413,7 @@ def _separate_setup(
 
     a null space of p unknowns t and b, however many clusters there are.
     """
-    p, slope, root = len(errors[0]), done.slope[0], done.list_root()
+    p, slope, root, null = len(errors[0]), done.slope[0], done.list_root(), done.null_directions()
     members: dict[int, list[int]] = {}
     for i in np.flatnonzero(kept).tolist():
         cluster = done.tree.cluster[factors[i].unknowns[:1]]
@@ -428,11 +429,12 @@ def _separate_setup(
         motion = noise * np.concatenate([factors[i].setup for i in group]).T
         D = root.fill(whole)[is_setup[whole]] @ motion
         e = np.concatenate([errors[i] for i in group], axis=1)
-        length = np.sqrt((D**2).sum(axis=1) + ((slope[unknowns] @ e) ** 2).sum(axis=1))
-        length = np.where(length > 0.0, length, 1.0)[:, None]
-        V, s, Qt = np.linalg.svd(D / length)
-        rank = int(are_nonzero(s).sum()) if s[0] > 0.0 else 0
-        turned = V.T @ (slope[unknowns] / length)
+        length, own = done.length[0][unknowns, None], null[unknowns]
+        own = length * own[:, own.any(axis=0)]  # no row decides along these
+        axes = np.linalg.qr(own, mode="complete")[0][:, own.shape[1] :].T
+        V, s, Qt = np.linalg.svd(axes @ (length * D))
+        rank = int(are_nonzero(s).sum()) if s.any() else 0
+        turned = V.T @ (axes @ (length * slope[unknowns]))
         H.append(turned[:rank] / s[:rank, None])
         N.append(turned[rank:])
         y.append(e @ Qt[:rank].T)
