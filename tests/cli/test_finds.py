@@ -3,6 +3,7 @@
 smallest that shows it, and the right answer.
 """
 
+import os
 import re
 import subprocess
 import sys
@@ -213,6 +214,22 @@ def test_summary_of_a_study_is_written_whole_or_not_at_all(loopcal, tmp_path) ->
     (tmp_path / "results/summary.csv").mkdir()
     loopcal("study summary results", "results/summary.csv: this is a folder", code=1)
     assert {path.name for path in (tmp_path / "results").iterdir()} == before | {"summary.csv"}
+
+
+def test_store_that_cannot_be_made_is_named_by_the_folder_of_its_study(tmp_path) -> None:
+    (tmp_path / "study.yaml").write_text(STUDY.replace("robot.yaml", "five-bar"), "utf-8")
+    (tmp_path / "poses.csv").write_text(POSES, "utf-8")
+    run = 'ulimit -f 2 && exec "$0" -m loopcal study run study.yaml -o out --quick --workers 1'
+    done = subprocess.run(
+        ["sh", "-c", run, sys.executable],
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": str(Path(lc.__file__).parents[1])},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert "loopcal: out/study.sqlite: the disk is full" in done.stderr
+    assert {path.name for path in tmp_path.iterdir()} == {"study.yaml", "poses.csv"}
 
 
 def test_noise_that_no_fit_survives_is_no_warning(loopcal, tmp_path) -> None:

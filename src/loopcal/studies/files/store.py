@@ -357,15 +357,18 @@ def _compute_digest(*values: Any) -> bytes:
     return hashlib.sha256(json.dumps(head).encode() + content).digest()
 
 
-def make_store(folder: Path, header: StoreHeader) -> None:
-    """Make an empty store in a folder.
+def make_store(folder: Path, header: StoreHeader, named: Path | None = None) -> None:
+    """Make an empty store in a folder, which messages call `named`.
 
     Raises FileError: it cannot be written, or the folder is on a network file system.
     """
     path = folder / NAME
     refuse_network(folder)
-    full = "store.not-made"
-    with _report_errors(path, full), closing(sqlite3.connect(path, timeout=PATIENCE)) as connection:
+    shown = path if named is None else named / NAME
+    with (
+        _report_errors(shown, "store.not-made"),
+        closing(sqlite3.connect(path, timeout=PATIENCE)) as connection,
+    ):
         connection.executescript(TABLES)
         StudyStore(path, connection).set_header(header)
 
@@ -598,7 +601,7 @@ def _make_folder(folder: Path, source: StudySource) -> None:
         engine = str(get_current_engine())
         versions = {PROGRAM: __version__, NUMERICS_PART: str(NUMERICS), ENGINE: engine}
         columns = tuple(column.name for column in study.columns)
-        make_store(temporary, StoreHeader(study.to_json(), columns, versions))
+        make_store(temporary, StoreHeader(study.to_json(), columns, versions), folder)
 
 
 def _refuse_content(folder: Path) -> None:
