@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from loopcal import engine
+from loopcal import engine, geometry
 from loopcal.engine import Group, Program, Slot, State
 from loopcal.errors import MechanismError, suggest_names
 from loopcal.findings import Finding, Quantity, report_finding
@@ -34,7 +34,11 @@ from loopcal.mechanism.mobility import (
 )
 from loopcal.mechanism.model import Mechanism, SlotMap, Stage
 from loopcal.mechanism.over_constraint import report_over_constraint
-from loopcal.mechanism.platform_coordinates import differentiate_coordinates, read_coordinates
+from loopcal.mechanism.platform_coordinates import (
+    COORDINATES,
+    differentiate_coordinates,
+    read_coordinates,
+)
 from loopcal.mechanism.sensitivity import differentiate_pose
 from loopcal.mechanism.states import is_closed, make_start
 from loopcal.mechanism.transmission import LOAD, list_constants, name_terms, nominal_terms
@@ -465,8 +469,12 @@ def _refuse_singular_start(robot: Mechanism, target: FloatArray) -> None:
     the stated ones the limbs are in a singular position. The error proposes those of home.
     """
     guess, values = robot.home_state, robot.values[None]
+    freedoms, twist = list(robot.program.freedoms), np.zeros(6)
     for seed in range(STARTS):
-        state = inverse_trials(robot, values, target, shake_joints(guess, seed))
+        turn = np.random.default_rng(seed).uniform(-0.3, 0.3, len(freedoms))
+        twist[freedoms] = turn * robot.size / robot.twist_scale[freedoms]
+        moved = replace(shake_joints(guess, seed), T=geometry.apply_twist(guess.T, twist))
+        state = inverse_trials(robot, values, target, moved)
         if state.status[0, 0] != engine.CONVERGED or abs(state.closure_sign[0, 0]) == 0.0:
             continue
         found: dict[tuple[str, str, float], tuple[str, Quantity]] = {}
@@ -479,6 +487,13 @@ def _refuse_singular_start(robot: Mechanism, target: FloatArray) -> None:
                         shown = robot.to_quantity(float(value), joint.dimension)
                         of_copies = name.rstrip("0123456789"), joint.name, round(value, 6)
                         found.setdefault(of_copies, (f"{name}.{joint.name}", shown))
+        poses = (read_coordinates(T, COORDINATES[:6])[0, 0] for T in (guess.T, state.T))
+        for i, (name, start, value) in enumerate(zip(COORDINATES[:6], *poses, strict=True)):
+            least = STRETCHED * (robot.size if i < 3 else 1.0)
+            if name not in robot.controlled and abs(value - start) > least:
+                dimension = Dimension.LENGTH if i < 3 else Dimension.ANGLE
+                shown = robot.to_quantity(float(value), dimension)
+                found["home", name, 0.0] = f"`home:` {name}", shown
         if found:
             joints, values = zip(*found.values(), strict=True)
             refused = {"name": robot.name, "joints": joints, "values": values}

@@ -475,3 +475,32 @@ def test_a_singular_start_is_refused_with_the_start_values_of_home(tmp_path: Pat
     parallel = UPU.replace("attach: [150", "attach: [300")  # singular at home itself
     with pytest.raises(MechanismError, match=r"cannot set the coordinates .* independently"):
         load_text(tmp_path, parallel)
+
+
+SCOTT_RUSSELL = """
+format: 1
+family: limbs
+name: russell
+units: {length: mm, angle: deg}
+freedoms: [x, z, ry]
+controlled: [x]
+bodies: [{name: crank}]
+limbs:
+  - {name: crank, to: crank, ending: rigid, chain: [{joint: R, name: pin, axis: -y, start: 45}]}
+  - name: bar
+    ending: rigid
+    chain:
+      - {joint: P, name: rail, axis: z, actuated: s, start: 150}
+      - {joint: R, name: pin, axis: y, start: 40}
+    attach: [-200, 0, 0]
+  - {name: mid, on: crank, tip: [100, 0, 0], attach: [-100, 0, 0], ending: ball}
+home: {x: 132}
+"""
+
+
+def test_a_home_without_its_rotation_is_refused_with_this_rotation(tmp_path: Path) -> None:
+    """A bar of 200 mm, with one end at x = 132 mm and level, is in a singular position."""
+    with pytest.raises(MechanismError, match=r"and `home:` pitch 48.7 deg.$"):  # acos(132 / 200)
+        load_text(tmp_path, SCOTT_RUSSELL)
+    robot = load_text(tmp_path, SCOTT_RUSSELL.replace("x: 132", "x: 132, pitch: 48.7"))
+    np.testing.assert_allclose(robot.home[0, 0], 0.66, rtol=0, atol=1e-12)

@@ -354,7 +354,7 @@ def build_tree(
         carrier[joint.child] = joint
     roots = [link for link in links if link not in carrier]
     if len(roots) != 1:
-        listed = ", ".join([*roots[:4], *([".."] if len(roots) > 4 else [])])
+        listed = ", ".join((*roots[:4], "..")[: len(roots)])
         sentence = f"this {what.removesuffix(' file')} has {len(roots)} root links ({listed})"
         raise FileError(f"{sentence}. Allowed: one. Join them", path)
     _refuse_cycles(path, links, roots[0], carrier)
