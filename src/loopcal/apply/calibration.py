@@ -10,26 +10,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from loopcal.apply import calibration_report
 from loopcal.apply.calibration_options import CalibrationOptions, DataSplit, split_data
-from loopcal.apply.calibration_report import (
-    ALL_POSES,
-    FEW_POSES,
-    LIMIT_MISSED,
-    SEARCH_LEVEL,
-    CalibrationReport,
-    Provenance,
-    explains_residuals,
-    report_fit,
-    report_freedoms,
-    report_heights,
-    report_unexplained,
-    report_validation,
-)
 from loopcal.apply.error_budget import compute_error_budget
 from loopcal.apply.height_errors import map_height_errors
 from loopcal.apply.validation import Validation, validate
 from loopcal.apply.volume_accuracy import VolumeAccuracy, as_volume, bound_errors
 from loopcal.checks import check_choice
+from loopcal.diagnose import error_causes
 from loopcal.diagnose.adjusted_uncertainty import (
     SHARED,
     add_shared_errors,
@@ -37,14 +25,6 @@ from loopcal.diagnose.adjusted_uncertainty import (
     is_explainable,
 )
 from loopcal.diagnose.conventions.convention_check import ConventionCheck, check_conventions
-from loopcal.diagnose.error_causes import (
-    explain_residuals,
-    find_print_scale,
-    find_swapped_pictures,
-    measure_drive_errors,
-    measure_picture_errors,
-    report_picture_scale,
-)
 from loopcal.diagnose.error_frames import BASE, FITTED, RELATIVE
 from loopcal.diagnose.fit_examination import check_start_values, compute_reading_errors, examine_fit
 from loopcal.diagnose.gauge_freedoms import interpret_fit
@@ -110,7 +90,7 @@ def calibrate(
     data: Measurements,
     options: CalibrationOptions | None = None,
     progress: Progress = report_no_progress,
-) -> CalibrationReport:
+) -> calibration_report.CalibrationReport:
     """Identify the free parameters of a robot, validate the result and judge it.
 
     Parameters
@@ -216,11 +196,11 @@ def _explain_residuals(
     linear, drives, explained, pictures = None, None, None, list[Finding]()
     if is_explainable(fit):
         linear = linearize_examined(fit, split.fitted)
-        explained = explain_residuals(linear)
-        drives = measure_drive_errors(linear, explained)
+        explained = error_causes.explain_residuals(linear)
+        drives = error_causes.measure_drive_errors(linear, explained)
         pictures = [
-            *measure_picture_errors(linear, explained),
-            *find_print_scale(fit, split.fitted),
+            *error_causes.measure_picture_errors(linear, explained),
+            *error_causes.find_print_scale(fit, split.fitted),
         ]
         fit = replace(fit, findings=(*fit.findings, *pictures))
     fit = adjust_uncertainty(fit, split.fitted, linear, explained, slow_p_value)
@@ -294,7 +274,7 @@ def _report(
     count: StepCounter,
     outliers: Sequence[Finding],
     linear: FitLinearization | None,
-) -> CalibrationReport:
+) -> calibration_report.CalibrationReport:
     """Validate and examine a fit, and return the report. `linear` : see `linearize_fit`."""
     fit, fitted, held_out = interpret_fit(fit), split.fitted, split.held_out
     count.begin("predicting the held-out poses" if held_out is not None else "computing errors")
@@ -331,22 +311,30 @@ def _report(
     findings = [
         # fit and validation answer doubts about conventions
         *(replace(finding, severity=Severity.INFO) for finding in doubts),
-        *(s for f in doubts for s in find_swapped_pictures(fit, fitted, f.data.get("poses", ()))),
-        *report_fit(fit),
-        *report_unexplained(fit, examined),
+        *(
+            s
+            for f in doubts
+            for s in error_causes.find_swapped_pictures(fit, fitted, f.data.get("poses", ()))
+        ),
+        *calibration_report.report_fit(fit),
+        *calibration_report.report_unexplained(fit, examined),
         *(  # the machine may have changed between days
             replace(f, severity=Severity.WARNING) if is_failed and f.code == SEVERAL_DAYS else f
             for f in check_instruments(split.list_observations())
         ),
         *impossible,
-        *(report_validation(errors, held_out is not None) if fit.converged else ()),
+        *(
+            calibration_report.report_validation(errors, held_out is not None)
+            if fit.converged
+            else ()
+        ),
         *of_volume,
         *([report_finding("workflow.held-out-repeats", names=repeats)] if repeats else []),
-        *report_freedoms(fit, fitted),
+        *calibration_report.report_freedoms(fit, fitted),
         *report_fixed_setup(fitted),
-        *report_picture_scale(fit.robot, fitted),
+        *error_causes.report_picture_scale(fit.robot, fitted),
         *(report_equal_setup(fit, fitted) if fit.converged else ()),
-        *report_heights(fit, fitted, heights),
+        *calibration_report.report_heights(fit, fitted, heights),
         *report_base_targets(fitted),
         start.finding,
         *outliers,
@@ -355,7 +343,7 @@ def _report(
         *(() if comparison is None else (comparison.outcome,)),
     ]
     count.begin("done")
-    return CalibrationReport(
+    return calibration_report.CalibrationReport(
         options=options,
         split=split,
         identification=fit,
@@ -373,7 +361,9 @@ def _report(
         change=change,
         comparison=comparison,
         volume=volume,
-        provenance=Provenance(collect_versions(), {"hold_out": options.seed}, options.to_dict()),
+        provenance=calibration_report.Provenance(
+            collect_versions(), {"hold_out": options.seed}, options.to_dict()
+        ),
     )
 
 
@@ -385,10 +375,11 @@ def _bound_volume(
     """
     if options.volume is None or not fit.converged:
         return None, []
-    if not (fit.residual_test.intervals and explains_residuals(fit)):
+    if not (fit.residual_test.intervals and calibration_report.explains_residuals(fit)):
         return None, [report_finding("accuracy.volume-open", reason="noise")]
     missed = errors is not None and any(
-        f.code in LIMIT_MISSED and f.data["quantity"] == "position" for f in errors.findings
+        f.code in calibration_report.LIMIT_MISSED and f.data["quantity"] == "position"
+        for f in errors.findings
     )
     limit = None if missed else options.limit_position
     try:
@@ -407,17 +398,20 @@ def _search_before_split(
     A wrong pose that is fitted hides among few others, and one that is held out is compared with a
     fit of few. The level is low, because fitted and held-out poses are searched again alone.
     """
-    has_few = split.fitted.n_rows < ENOUGH_ROWS * len(fit.names) and data.n_poses <= FEW_POSES
+    has_few = (
+        split.fitted.n_rows < ENOUGH_ROWS * len(fit.names)
+        and data.n_poses <= calibration_report.FEW_POSES
+    )
     if split.held_out is None or options.prior is not None or not has_few:
         return []
     together = replace(data, is_held_out=np.zeros(data.n_poses, dtype=bool))
     whole = identify(fit.initial, together, options=options.fit)
     if not (fit.converged and whole.converged):
         return []
-    check = find_outliers(whole, together, level=SEARCH_LEVEL)
+    check = find_outliers(whole, together, level=calibration_report.SEARCH_LEVEL)
     if not check.names:
         return []
-    return [report_finding(ALL_POSES, poses=check.names, blocks=check.blocks)]
+    return [report_finding(calibration_report.ALL_POSES, poses=check.names, blocks=check.blocks)]
 
 
 def _validate(

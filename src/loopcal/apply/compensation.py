@@ -43,18 +43,13 @@ from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, Severity, report_finding
 from loopcal.findings.wording import name_count
 from loopcal.geometry import align_point_sets, wrap_angle
+from loopcal.mechanism import workspace
 from loopcal.mechanism.assembly import AXES, TWIST_UNITS
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import POSITION, TILT, list_dimensions, read_coordinates
 from loopcal.mechanism.sensitivity import differentiate_pose
 from loopcal.mechanism.solutions import Solution, are_poses, forward, inverse
 from loopcal.mechanism.states import Status
-from loopcal.mechanism.workspace import (
-    check_limits,
-    draw_coordinates,
-    sample_workspace,
-    workspace_ranges,
-)
 from loopcal.results.description import Field, fields, label_axes
 from loopcal.results.result import TableResult
 from loopcal.typing import BoolArray, FloatArray, Progress, StepCounter, report_no_progress
@@ -414,7 +409,7 @@ def _report_targets(
 ) -> tuple[Finding, ...]:
     """Return one finding for each target."""
     distances = distances * twist_weights(robot.size) / robot.size
-    allowed, why = check_limits(robot, robot.values[None], final.q[None], final.state)
+    allowed, why = workspace.check_limits(robot, robot.values[None], final.q[None], final.state)
     first, last = np.linalg.norm(distances[[0, -1]], axis=2)
     is_loose = last > np.maximum(REDUCED * first, ROUNDING)
     position = np.linalg.norm(not_compensable[:, 3:], axis=1)
@@ -520,7 +515,7 @@ def make_tables(
         reason = "equal"
     if reason:
         raise DataError(_refuse(robot, reason))
-    ranges = workspace_ranges(robot)
+    ranges = workspace.workspace_ranges(robot)
     moved = {"height": ["z"], "skew": ["x", "y", "z"]}.get(size.what, list(names))
     machine = _Machine(robot, controller, [names.index(name) for name in moved])
     axes, home = list(names), read_coordinates(robot.home, names)
@@ -534,9 +529,11 @@ def make_tables(
         return targets
 
     if size.what == "readings":
-        targets = sample_workspace(robot, 4 * CHECKS).coordinates
+        targets = workspace.sample_workspace(robot, 4 * CHECKS).coordinates
     else:
-        targets = place(draw_coordinates(np.random.default_rng(0), tuple(axes), ranges, CHECKS))
+        targets = place(
+            workspace.draw_coordinates(np.random.default_rng(0), tuple(axes), ranges, CHECKS)
+        )
     before = machine.lead(targets, targets)
     targets, before = (rows[np.isfinite(before).all(axis=1)] for rows in (targets, before))
     if not len(targets):

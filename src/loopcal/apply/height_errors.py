@@ -20,12 +20,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from loopcal.diagnose.row_errors import (
-    PredictionComparison,
-    Statistics,
-    compare_predictions,
-    compute_statistics,
-)
+from loopcal.diagnose import row_errors
 from loopcal.errors import DataError
 from loopcal.estimate.residual_test import DOUBT
 from loopcal.estimate.result import Identification
@@ -94,9 +89,11 @@ class HeightErrors(DrawnResult):
         ),
     )
 
-    def statistics(self, errors: str, held_out: bool) -> Statistics:
+    def statistics(self, errors: str, held_out: bool) -> row_errors.Statistics:
         """Return the error statistics "before" or "after" of held-out or fitted heights [m]."""
-        return compute_statistics(np.abs(getattr(self, errors)[self.is_held_out == held_out]))
+        return row_errors.compute_statistics(
+            np.abs(getattr(self, errors)[self.is_held_out == held_out])
+        )
 
     def report_alternatives(self, count: int) -> list[Finding]:
         """Return the wrong zero of the probe, and the tilted bed, that heights cannot tell apart
@@ -149,7 +146,7 @@ def map_height_errors(
         if data is None or not any(_measures_height(o) for o in data.observations):
             continue
         try:
-            compared = compare_predictions(
+            compared = row_errors.compare_predictions(
                 fit.initial, fit.robot, data, fit.nuisance.starts, fit.nuisance.values
             )
         except DataError:  # the validation reports that no pose is reached
@@ -197,7 +194,7 @@ def _measures_height(rows: Observations) -> bool:
 
 
 def _list_heights(
-    compared: PredictionComparison, robot: Mechanism
+    compared: row_errors.PredictionComparison, robot: Mechanism
 ) -> Iterator[tuple[tuple[str, ...], FloatArray, FloatArray, FloatArray]]:
     """Yield labels, places (r, 2) and errors (r,) before and after of each kind of heights."""
     rows = compared.data.observations

@@ -15,14 +15,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from loopcal.diagnose import model_discrepancy
+from loopcal.diagnose import error_frames, model_discrepancy
 from loopcal.diagnose.error_causes import OUTLIERS, explain_residuals
-from loopcal.diagnose.error_frames import (
-    FITTED,
-    MOST_POSES,
-    linearize_tool_errors,
-    locate_measured_poses,
-)
 from loopcal.diagnose.residual_patterns import (
     BLOCK,
     ORDER,
@@ -101,7 +95,7 @@ def adjust_uncertainty(
     if explained is None:
         explained = explain_residuals(linear)
     if linear.solution.linearized is None or fit.poses is not None:
-        T = locate_measured_poses(fit, data).T
+        T = error_frames.locate_measured_poses(fit, data).T
     else:  # readings are exact, and the linearization has kept the poses
         poses = linear.solution.linearized
         T = poses.T[0, poses.is_reached[0]]
@@ -161,10 +155,13 @@ def _add_patterns(
         return fit
     # orientation and position (3 n, p) of evenly chosen measured poses, frames fitted, by the
     # parameters [per SI], and the sum of the variances of each that the fit states
-    solution = locate_measured_poses(fit, data)
-    solution = solution.take(choose_evenly(len(solution.q), MOST_POSES))
+    solution = error_frames.locate_measured_poses(fit, data)
+    solution = solution.take(choose_evenly(len(solution.q), error_frames.MOST_POSES))
     posterior = fit.posterior
-    D = linearize_tool_errors(posterior, solution, FITTED).by_parameters / posterior.unit
+    D = (
+        error_frames.linearize_tool_errors(posterior, solution, error_frames.FITTED).by_parameters
+        / posterior.unit
+    )
     effects_of = [D[:, rows].reshape(-1, D.shape[-1]) for rows in (slice(0, 3), slice(3, 6))]
     tool = [(E, float(((E @ posterior.root) ** 2).sum())) for E in effects_of]
     for effect in effects:

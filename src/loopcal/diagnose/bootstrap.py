@@ -32,15 +32,7 @@ from typing import Any, ClassVar, Literal, NamedTuple, get_args
 import numpy as np
 
 from loopcal.checks import check_choice
-from loopcal.diagnose.intervals import (
-    ENDS,
-    NAMED,
-    OFF,
-    Intervals,
-    compare_ends,
-    mask_intervals,
-    report_intervals,
-)
+from loopcal.diagnose import intervals
 from loopcal.diagnose.outliers import TESTABLE
 from loopcal.diagnose.residual_patterns import number_days, order_by_time
 from loopcal.errors import EstimationError
@@ -403,10 +395,10 @@ class BlockScatter:
         """
         tested = np.isfinite(self.tail) & (self.noise_degrees >= FEWEST_DEGREES)
         level = 0.5 * compute_single_level(FALSE_ALARMS, int(tested.sum()))
-        larger = (ratio > 1.0 + OFF) & (self.tail < level)
-        smaller = (ratio < 1.0 / (1.0 + OFF)) & (self.tail > 1.0 - level)
+        larger = (ratio > 1.0 + intervals.OFF) & (self.tail < level)
+        smaller = (ratio < 1.0 / (1.0 + intervals.OFF)) & (self.tail > 1.0 - level)
         off = tested & (larger | smaller)
-        unit = {"unit": blocks.unit, "blocks": blocks.count, "limit": OFF}
+        unit = {"unit": blocks.unit, "blocks": blocks.count, "limit": intervals.OFF}
         if not off.any():
             return report_finding("sampling.scatter-agrees", **unit)
         order = np.argsort(-np.where(off, np.abs(np.log(ratio)), -1.0))[: int(off.sum())]
@@ -415,7 +407,7 @@ class BlockScatter:
             **unit,
             count=int(off.sum()),
             total=len(names),
-            names=tuple(names[i] for i in order[:NAMED]),
+            names=tuple(names[i] for i in order[: intervals.NAMED]),
             ratio=float(ratio[order[0]]),
         )
 
@@ -537,7 +529,9 @@ class Bootstrap(TableResult):
         """(p,) of the resamples [SI]; infinite where the data determine no parameter."""
         return np.where(self.is_known, self.draws.std(axis=0, ddof=1), np.inf)
 
-    def intervals(self, level: float = LEVEL, kind: IntervalKind = "widened") -> Intervals:
+    def intervals(
+        self, level: float = LEVEL, kind: IntervalKind = "widened"
+    ) -> intervals.Intervals:
         """Return intervals of the parameters.
 
         Parameters
@@ -550,7 +544,9 @@ class Bootstrap(TableResult):
         """
         check_choice("kind of interval", kind, get_args(IntervalKind))
         estimate, weight = self.fit.estimate, np.full(len(self.draws), 1.0 / len(self.draws))
-        quantile, linear, error = compare_ends(self.draws, weight, self.linear, weight, level)
+        quantile, linear, error = intervals.compare_ends(
+            self.draws, weight, self.linear, weight, level
+        )
         half = 0.5 * (linear[1] - linear[0])
         with np.errstate(divide="ignore", invalid="ignore"):
             shift, shift_error = (quantile - linear) / half, error / half
@@ -560,14 +556,14 @@ class Bootstrap(TableResult):
             quantile, linear = (estimate + (ends - estimate) * widen for ends in (quantile, linear))
         elif kind != "percentile":
             quantile = self._find_ends(kind, level)
-        return mask_intervals(
+        return intervals.mask_intervals(
             self.is_known,
             self.fit.names,
             level,
             f"{self.scheme} bootstrap, {kind}",
             center=self.draws.mean(axis=0),
             sd=self.draws.std(axis=0, ddof=1),
-            **dict(zip(ENDS, (*quantile, *linear), strict=True)),
+            **dict(zip(intervals.ENDS, (*quantile, *linear), strict=True)),
             shift=shift,
             shift_error=shift_error,
         )
@@ -580,7 +576,7 @@ class Bootstrap(TableResult):
         if self.failed > MOST_FAILED * total:
             findings.append(report_finding("sampling.failures", failed=self.failed, count=total))
         codes = ("sampling.bootstrap-agrees", "sampling.bootstrap-differs")
-        findings += report_intervals(self.intervals(kind="percentile"), *codes)
+        findings += intervals.report_intervals(self.intervals(kind="percentile"), *codes)
         if self.fit.method.is_biased:
             name = type(self.fit.method).__name__
             findings.append(report_finding("sampling.bias-not-drawn", method=name))

@@ -49,15 +49,10 @@ from loopcal.diagnose.residual_patterns import (
     test_effect,
 )
 from loopcal.errors import LoopcalError
+from loopcal.estimate import residual_test
 from loopcal.estimate.fit_linearization import FitLinearization
 from loopcal.estimate.identification import identify
 from loopcal.estimate.linearization import evaluate_rows
-from loopcal.estimate.residual_test import (
-    DOUBT,
-    FEWEST_DEGREES,
-    choose_severity,
-    count_sigma_degrees,
-)
 from loopcal.estimate.result import Identification
 from loopcal.estimate.smooth_errors import describe_smooth_errors
 from loopcal.findings import Finding, Severity, report_finding
@@ -416,8 +411,10 @@ def explain_residuals(linear: FitLinearization, *, is_doubted: bool = False) -> 
     fit, data, rows = linear.fit, linear.data, collect_residual_rows(linear)
     if rows is None:
         return ExplainedResiduals(None)
-    is_doubted |= fit.residual_test.exact_p_value < DOUBT
-    known = count_sigma_degrees(fit.residual_test.noise, fit.options.sigma_uncertainty)
+    is_doubted |= fit.residual_test.exact_p_value < residual_test.DOUBT
+    known = residual_test.count_sigma_degrees(
+        fit.residual_test.noise, fit.options.sigma_uncertainty
+    )
     poses = linear.solution.linearized
     T = forward(fit.robot, data.readings).T if poses is None else poses.T[0]
     tool = fit.robot.tool[:3, 3]
@@ -440,7 +437,7 @@ def explain_residuals(linear: FitLinearization, *, is_doubted: bool = False) -> 
     doubt = fit.residual_test.exact_p_value
     levels = [doubt, *[1.0] * len(causes)]  # the first explains what the noise does not
     causes = tuple(
-        c._replace(severity=choose_severity(min(c.p_value, level)))
+        c._replace(severity=residual_test.choose_severity(min(c.p_value, level)))
         for c, level in zip(causes, levels, strict=False)
     )
     if few is not rows and causes:
@@ -460,7 +457,7 @@ def compare_causes(
     causes: list[Cause] = []
     listed = list(effects)
     alike = Counter(effect.source for effect in effects)
-    while len(causes) < MOST_CAUSES and remainder.degrees >= FEWEST_DEGREES:
+    while len(causes) < MOST_CAUSES and remainder.degrees >= residual_test.FEWEST_DEGREES:
         spectra = [remainder.find_spectrum(effect.scaled) for effect in listed]
         seen = [
             i

@@ -11,15 +11,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from loopcal.diagnose import error_frames
+from loopcal.diagnose import error_causes, error_frames
 from loopcal.diagnose.adjusted_uncertainty import HeavyTails, check_heavy_tails
-from loopcal.diagnose.error_causes import (
-    OUTLIERS,
-    ZOOMED,
-    explain_residuals,
-    find_swapped_pictures,
-    measure_picture_errors,
-)
 from loopcal.diagnose.model_discrepancy import LackOfFit, check_lack_of_fit
 from loopcal.diagnose.outliers import OutlierCheck, find_outliers
 from loopcal.diagnose.residual_patterns import CAUSE, linearize_examined
@@ -226,14 +219,18 @@ def examine_fit(
         linear = linearize_examined(fit, data, linear)
     known = [f for f in fit.findings if f.code == CAUSE]
     if outliers.suspects and not known and linear is not None:
-        explained = explain_residuals(linear, is_doubted=True)
+        explained = error_causes.explain_residuals(linear, is_doubted=True)
         causes = tuple(cause.finding for cause in explained.causes)
-        sizes = measure_picture_errors(linear, explained)
+        sizes = error_causes.measure_picture_errors(linear, explained)
     found = [f.data["cause"] for f in (*known, *causes)]
-    if OUTLIERS in found:
-        sizes = find_swapped_pictures(fit, data, outliers.suspects)
+    if error_causes.OUTLIERS in found:
+        sizes = error_causes.find_swapped_pictures(fit, data, outliers.suspects)
     shown = outliers
-    if outliers.suspects and found and {OUTLIERS, ZOOMED}.isdisjoint(found):
+    if (
+        outliers.suspects
+        and found
+        and {error_causes.OUTLIERS, error_causes.ZOOMED}.isdisjoint(found)
+    ):
         name = next(f.data["name"] for f in (*known, *causes))
         explained = report_finding(
             "outliers.explained", poses=outliers.suspects, cause=found[0], name=name

@@ -37,19 +37,12 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 
 from loopcal.diagnose.residual_patterns import ResidualRows, collect_residual_rows, collect_rows
+from loopcal.estimate import residual_test
 from loopcal.estimate.fit_linearization import FitLinearization, fold_smooth_errors
 from loopcal.estimate.free_parameters import choose_pivots
 from loopcal.estimate.identification import prepare_fitted_data
 from loopcal.estimate.posterior import DISCREPANCY, ModelDiscrepancy, combine_degrees
 from loopcal.estimate.problem import problem_of
-from loopcal.estimate.residual_test import (
-    FALSE_ALARMS,
-    FEWEST_DEGREES,
-    SIGNIFICANCE,
-    choose_severity,
-    count_sigma_degrees,
-    coverage_factor,
-)
 from loopcal.estimate.result import Identification, add_covariance
 from loopcal.estimate.smooth_errors import (
     CENTERS,
@@ -110,7 +103,7 @@ def check_map(
         return untested._replace(regions=int(known.sum()))
     before, after = (squares[known] for squares in left)
     count, removed = len(before), before - after
-    half = float(coverage_factor(count - 1.0)) * np.sqrt(count) * removed.std(ddof=1)
+    half = float(residual_test.coverage_factor(count - 1.0)) * np.sqrt(count) * removed.std(ddof=1)
     number = np.isin(regions, np.flatnonzero(known)).sum()
     rms = np.sqrt(np.array([before.sum(), after.sum()]) / number).tolist()
     return MapTest(rms[0], rms[1], float((removed.sum() - half) / before.sum()), count)
@@ -156,7 +149,7 @@ UNMEASURED_SHARE = 0.01
 # for these.
 ROUGH, MOST_ROUGH = 1e-3, 150
 # Probability that independent errors look like slow errors of the poses, over all tests of a fit.
-LEVEL = FALSE_ALARMS["model discrepancy"]
+LEVEL = residual_test.FALSE_ALARMS["model discrepancy"]
 # Probability without errors in a direction below which it has some, once its machine shows any.
 DIRECTION_LEVEL = 0.3
 FEWEST_REGIONS = 8  # of which each is left out; of fewer, a quarter is not a share of the regions
@@ -206,7 +199,7 @@ def find_slow_errors(
     """
     fit, tool = linear.fit, linear.fit.robot.tool[:3, 3]
     # deviations from nominal show errors, too, but only as far as the spreads are right
-    if len(T) < FEWEST_POSES or fit.residual_test.degrees < FEWEST_DEGREES:
+    if len(T) < FEWEST_POSES or fit.residual_test.degrees < residual_test.FEWEST_DEGREES:
         return None
 
     def project(
@@ -226,7 +219,9 @@ def find_slow_errors(
     groups = find_measured_directions(tested[0])
     measured = np.hstack([np.zeros((6, 0)), *groups])
     short = project(SHORT_KERNELS[:1], measured, FINE_CENTERS) if measured.size else []
-    known = count_sigma_degrees(fit.residual_test.noise, fit.options.sigma_uncertainty)
+    known = residual_test.count_sigma_degrees(
+        fit.residual_test.noise, fit.options.sigma_uncertainty
+    )
     lengths = (*tested, *short)
     level = statistics.compute_single_level(LEVEL, len(lengths)) if named == 1.0 else 1.0
     slow = [detect_slow_errors(rows, groups, known, level) for rows in lengths]
@@ -348,7 +343,9 @@ def add_slow_errors(fit: Identification, slow: SlowErrors) -> Identification:
             p_value=p_value,
             is_slow=slow.is_slow,
             level=LEVEL if slow.is_slow else REPEATS_LEVEL,
-            severity=choose_severity(p_value),  # a warning where they are beyond doubt
+            severity=residual_test.choose_severity(
+                p_value
+            ),  # a warning where they are beyond doubt
         )
         fit = add_covariance(fit, of_part, common, finding)
     return replace(fit, posterior=replace(fit.posterior, discrepancy=discrepancy))
@@ -461,7 +458,7 @@ def project_slow_errors(linear: FitLinearization, errors: SmoothErrors) -> SlowE
     top = np.asarray(np.linalg.qr(np.concatenate([first, prior[penalty > 0.0]]), mode="r"))
     rest = np.linalg.qr(np.concatenate([factor[p:, p:], top[k:, k:]]), mode="r")
     degrees = int(linear.linearization.equations[0] + (penalty > 0.0).sum()) - k
-    if degrees < FEWEST_DEGREES:
+    if degrees < residual_test.FEWEST_DEGREES:
         return None
     slope = linear.fit.tolerance[:, None] * (to_z @ np.linalg.solve(top[:k, :k], top[:k, k:-1]))
     rest = np.asarray(rest[: min(m, degrees)])  # further rows are rounding
@@ -556,9 +553,9 @@ def check_lack_of_fit(fit: Identification, data: Measurements) -> LackOfFit:
     if p_value < REPEATS_LEVEL:
         findings = [report_finding("residuals.lack-of-fit", ratio=float(np.sqrt(ratio)))]
     tail = float(statistics.compute_chi_square_tail(degrees, scale**2 * degrees))
-    if tail < SIGNIFICANCE:
+    if tail < residual_test.SIGNIFICANCE:
         findings.append(report_finding("residuals.repeatability-larger", scale=scale))
-    if tail > 1.0 - SIGNIFICANCE:
+    if tail > 1.0 - residual_test.SIGNIFICANCE:
         findings.append(report_finding("residuals.repeatability-smaller", scale=scale))
     numbers = (*known, lack, lack_degrees, p_value, p_value >= REPEATS_LEVEL)
     return LackOfFit(tuple(findings), *numbers)

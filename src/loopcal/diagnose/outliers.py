@@ -30,6 +30,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from loopcal.errors import EstimationError, LoopcalError
+from loopcal.estimate import residual_test
 from loopcal.estimate.fit_descent import estimate_scale_of, measure_block_distances
 from loopcal.estimate.identification import identify, prepare_fitted_data
 from loopcal.estimate.linearization import LeverageRows, Linearization, PoseSolution, Start
@@ -37,12 +38,6 @@ from loopcal.estimate.losses import Tukey
 from loopcal.estimate.observation_rows import linked_blocks, list_block_labels
 from loopcal.estimate.penalties import decompose_for
 from loopcal.estimate.problem import Problem, problem_of
-from loopcal.estimate.residual_test import (
-    FALSE_ALARMS,
-    FEWEST_DEGREES,
-    SIGNIFICANCE,
-    count_sigma_degrees,
-)
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
 from loopcal.measure.measurements import Measurements
@@ -350,7 +345,9 @@ def fit_without(
     influence, plain = compute_influence(problem, kept, member, d, fits, weight, shared)
     unexplained, degrees = float(d.unexplained[0]), float(d.rows[0] - d.rank[0])
     is_given = noise == "given"
-    fewest, otherwise, scale = (FEWEST_DEGREES, np.inf, 1.0) if is_given else (1, 0.0, np.nan)
+    fewest, otherwise, scale = (
+        (residual_test.FEWEST_DEGREES, np.inf, 1.0) if is_given else (1, 0.0, np.nan)
+    )
     left = degrees - np.where(excluded, 0, plain.degrees)
     square = unexplained - np.where(excluded, 0.0, plain.distance)
     is_shown = left >= fewest
@@ -547,7 +544,7 @@ class OutlierCheck(TableResult):
 def find_outliers(
     fit: Identification,
     data: Measurements,
-    level: float = FALSE_ALARMS["outliers"],
+    level: float = residual_test.FALSE_ALARMS["outliers"],
     progress: Progress = report_no_progress,
 ) -> OutlierCheck:
     """Find the observation blocks that do not fit what all others predict.
@@ -600,9 +597,9 @@ def find_outliers(
     is_converged, suspected = search.is_converged, int(ambiguous.sum())
     summary = _summarize(fit, len(outliers), suspected, level, shared, is_converged=is_converged)
     # whether the fitted blocks exceed the stated noise beyond doubt
-    stated = count_sigma_degrees(noise, fit.options.sigma_uncertainty)
+    stated = residual_test.count_sigma_degrees(noise, fit.options.sigma_uncertainty)
     tail = statistics.compute_f_tail(end.left, stated, end.scale**2)
-    if noise == "given" and outliers and end.left > 0.0 and tail < SIGNIFICANCE:
+    if noise == "given" and outliers and end.left > 0.0 and tail < residual_test.SIGNIFICANCE:
         summary = (report_finding("outliers.larger-noise", times=end.scale, **shared), *summary)
     return OutlierCheck(
         outliers, conflicts, is_converged, level, tested, labels, end.influence, end.scale, summary

@@ -38,15 +38,8 @@ from loopcal.measure.readings import list_sensed_joints, select_joint_values
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import read_coordinates
 from loopcal.mechanism.solutions import Solution, inverse, make_solution
+from loopcal.numerics import statistics
 from loopcal.numerics.elimination import UnknownRoot
-from loopcal.numerics.statistics import (
-    NEAR_ONE,
-    compute_chi_square_quantile,
-    compute_chi_square_tail,
-    find_distinct_rows,
-    invert_increasing,
-    student_probability,
-)
 from loopcal.numerics.trial_batch import map_arrays
 from loopcal.parameters import ParameterTable
 from loopcal.typing import BoolArray, FloatArray, IntArray
@@ -77,16 +70,16 @@ def _median_of_largest(variances: FloatArray) -> float:
     degrees, unit = mean**2 / square, square / mean
     # if all errors were like one of them, the largest would be below its limit half of the time
     exceeded = -np.expm1(np.log(0.5) / len(mean))
-    limits = unit * compute_chi_square_quantile(degrees, exceeded)
+    limits = unit * statistics.compute_chi_square_quantile(degrees, exceeded)
     lowest = float(limits.min())
 
     def compute_log_probability(above: float) -> float:
-        tail = compute_chi_square_tail(degrees, (lowest + above) / unit)
-        return float(np.log1p(-np.minimum(tail, NEAR_ONE)).sum())
+        tail = statistics.compute_chi_square_tail(degrees, (lowest + above) / unit)
+        return float(np.log1p(-np.minimum(tail, statistics.NEAR_ONE)).sum())
 
     width = float(limits.max()) - lowest
     if width > 1e-12 * lowest:
-        lowest += invert_increasing(compute_log_probability, np.log(0.5), width, 50)
+        lowest += statistics.invert_increasing(compute_log_probability, np.log(0.5), width, 50)
     return float(np.sqrt(lowest))
 
 
@@ -280,7 +273,7 @@ class KindErrors:
             return 0.5 + 0.5 * float(np.sign(self.gain))
         both = zip(squares, (degrees, self.slow_degrees), strict=True)
         degrees = min(float(combine_degrees(total, both)), MOST_DEGREES)
-        return float(student_probability(degrees, self.gain / np.sqrt(total)))
+        return float(statistics.student_probability(degrees, self.gain / np.sqrt(total)))
 
 
 def compute_statistics(values: FloatArray) -> Statistics:
@@ -440,7 +433,7 @@ class PosePredictions:
             sizes.append(size := np.zeros(len(o)))
             if not used.size:
                 continue
-            sets, set_of = find_distinct_rows(used)
+            sets, set_of = statistics.find_distinct_rows(used)
             order = np.argsort(set_of, kind="stable")
             parts = np.split(order, np.cumsum(np.bincount(set_of))[:-1])
             for own, mine in zip(sets, parts, strict=True):  # so that derivatives are of few rows

@@ -13,35 +13,13 @@ from typing import Any
 import numpy as np
 
 from loopcal.errors import DataError
-from loopcal.estimate import free_parameters
+from loopcal.estimate import fit_descent, free_parameters, pose_estimate, posterior
 from loopcal.estimate.descent import Descent
-from loopcal.estimate.fit_descent import (
-    add_loss_uncertainty,
-    add_setup_uncertainty,
-    get_method,
-    report_closure_start,
-)
 from loopcal.estimate.information import FrameRows, UnfixedMotions, describe_frames
 from loopcal.estimate.linearization import Linearization, PoseEstimates
 from loopcal.estimate.observation_rows import Residuals, linked_blocks
 from loopcal.estimate.options import FitOptions
 from loopcal.estimate.penalties import Method, Regularization, describe_regularization
-from loopcal.estimate.pose_estimate import (
-    EstimatedPoses,
-    UnclosedPoses,
-    estimate_poses,
-    predict_from_readings,
-    report_doubtful_readings,
-    report_uneven_sigmas,
-)
-from loopcal.estimate.posterior import (
-    Posterior,
-    VarianceSources,
-    compute_posterior,
-    describe_information,
-    find_shown_noise,
-    find_variance_sources,
-)
 from loopcal.estimate.prior_inflation import PriorConflict, add_factor_uncertainty, run_prior_tests
 from loopcal.estimate.problem import Problem, problem_of
 from loopcal.estimate.residual_test import FEWEST_DEGREES, NOTABLE, ResidualTest, run_residual_test
@@ -92,7 +70,7 @@ class FitAnalysis:
     weights: FloatArray
     weighted: Problem
     fit: Descent
-    unclosed: UnclosedPoses
+    unclosed: pose_estimate.UnclosedPoses
 
     def identification(self) -> Identification:
         """Return the result, whose fields are computed when they are asked for."""
@@ -144,18 +122,18 @@ class FitAnalysis:
     @property
     def method(self) -> Method:
         """The method that was used."""
-        return get_method(self.options)
+        return fit_descent.get_method(self.options)
 
     # --- noise and uncertainty
 
     @cached_property
-    def _noise(self) -> tuple[ResidualTest, VarianceSources]:
+    def _noise(self) -> tuple[ResidualTest, posterior.VarianceSources]:
         options, d, penalty = self.options, self.fit.decomposition, self.fit.penalty
         is_assumed = options.noise == "given" and self.data.noise_source != "stated"
         noise, is_weighted = ASSUMED if is_assumed else options.noise, options.loss is not None
         uncertainty = options.sigma_uncertainty
         test = run_residual_test(d, penalty, noise, uncertainty, is_weighted, self.is_converged)
-        sources = find_variance_sources(d, penalty, test, self.method, self.free)
+        sources = posterior.find_variance_sources(d, penalty, test, self.method, self.free)
         return replace(test, intervals=bool(np.isfinite(sources.noise))), sources
 
     @property
@@ -164,7 +142,7 @@ class FitAnalysis:
         return self._noise[0]
 
     @property
-    def sources(self) -> VarianceSources:
+    def sources(self) -> posterior.VarianceSources:
         """What the variances are made of."""
         return self._noise[1]
 
@@ -176,14 +154,16 @@ class FitAnalysis:
         return scaled * scale[:, None] * scale
 
     @cached_property
-    def stated_posterior(self) -> Posterior:
+    def stated_posterior(self) -> posterior.Posterior:
         """The same by directions."""
         linearization, motions = self._estimated[2:]
         prior, noise = self.options.prior, self.sources.noise
         frames = describe_frames(self.weighted, self.data, motions, prior, linearization, noise)
         free, fit = self.free, self.fit
         at = self.corrected, free.places, free.tolerance, fit.decomposition, fit.penalty
-        return compute_posterior(*at, self.sources, frames, self.residual_test.noise_degrees)
+        return posterior.compute_posterior(
+            *at, self.sources, frames, self.residual_test.noise_degrees
+        )
 
     @cached_property
     def prior_tests(self) -> tuple[PriorConflict | None, list[Finding]]:
@@ -246,10 +226,14 @@ class FitAnalysis:
         return label_residuals(self._estimated[1], self.data, self.problem)
 
     @cached_property
-    def poses(self) -> EstimatedPoses | None:
+    def poses(self) -> pose_estimate.EstimatedPoses | None:
         """Pose and reading estimates, where readings are uncertain."""
         estimates, excluded = self._estimated[0], tuple(self.options.excluded_poses)
-        return None if estimates is None else estimate_poses(estimates, self.data, excluded)
+        return (
+            None
+            if estimates is None
+            else pose_estimate.estimate_poses(estimates, self.data, excluded)
+        )
 
     @cached_property
     def stated_nuisance(self) -> NuisanceEstimate:
@@ -277,11 +261,13 @@ class FitAnalysis:
         stated = {name: self._later(f"stated_{name}") for name in COMPLETED}
         result = add_factor_uncertainty(self._identification(**stated), self.fit)
         if (setup := self.weighted.nuisance) is not None and setup.has_prior.any():
-            result = add_setup_uncertainty(result, self.fit)
+            result = fit_descent.add_setup_uncertainty(result, self.fit)
         if self.options.loss is None:
             return result
         blocks = linked_blocks(self.data)
-        return add_loss_uncertainty(result, self.fit, self.problem, self.weighted, blocks)
+        return fit_descent.add_loss_uncertainty(
+            result, self.fit, self.problem, self.weighted, blocks
+        )
 
     @cached_property
     def fitted_rows(self) -> FittedRows | None:
@@ -293,15 +279,15 @@ class FitAnalysis:
         return None if earlier.fitted_rows is None else earlier.fitted_rows.joined(rows)
 
     @cached_property
-    def posterior(self) -> Posterior:
+    def posterior(self) -> posterior.Posterior:
         """The uncertainty by directions."""
         d, test = self.fit.decomposition, self.residual_test
-        shown = find_shown_noise(d, test)
+        shown = posterior.find_shown_noise(d, test)
         return replace(
             self.completed.posterior,
             fitted_rows=self.fitted_rows,
             shown_noise=shown,
-            information=describe_information(self.free, d, test, shown),
+            information=posterior.describe_information(self.free, d, test, shown),
         )
 
     @cached_property
@@ -310,8 +296,8 @@ class FitAnalysis:
         fit, free, options, problem = self.fit, self.free, self.options, self.problem
         on_poses = list[Finding]()
         if (poses := self.poses) is not None:
-            doubtful = report_doubtful_readings(self.corrected, poses)
-            on_poses = [*poses.report(), *doubtful, *report_uneven_sigmas(problem)]
+            doubtful = pose_estimate.report_doubtful_readings(self.corrected, poses)
+            on_poses = [*poses.report(), *doubtful, *pose_estimate.report_uneven_sigmas(problem)]
         method, excluded = self.method, tuple(options.excluded_poses)
         return (
             *([] if self.is_converged else [self.history.finding]),
@@ -322,7 +308,7 @@ class FitAnalysis:
             *(combination.finding for combination in self.unidentifiable),
             *self.stated_nuisance.report_unobservable(),
             *free.findings(),
-            *report_closure_start(problem, options, fit),
+            *fit_descent.report_closure_start(problem, options, fit),
             *([] if self.regularization is None else [self.regularization.finding]),
             *report_unknown_bias(free, method, self.sources.prior),
             *report_equations(int(problem.equations[0]), problem.parameters, method),
@@ -355,7 +341,7 @@ def fit_setup_alone(
     """
     table = nuisance.table
     unknown = np.where(table.free & np.isnan(table.tolerance), np.nan, nuisance.values())
-    solution, known = predict_from_readings(robot, data)
+    solution, known = pose_estimate.predict_from_readings(robot, data)
     reached = solution.converged & known
     if not reached.any():
         return unknown

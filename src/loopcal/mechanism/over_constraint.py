@@ -21,14 +21,9 @@ import numpy as np
 from loopcal.engine import State
 from loopcal.errors import MechanismError
 from loopcal.findings import Finding, report_finding
+from loopcal.mechanism import limb_rows
 from loopcal.mechanism.assembly import AXES, Assembly
 from loopcal.mechanism.kinematics import compute_readings, forward_trials
-from loopcal.mechanism.limb_rows import (
-    differentiate_displacements,
-    linearize_state,
-    stack_limb_rows,
-    stack_scaled_rows,
-)
 from loopcal.mechanism.mobility import RANK, check_assembly
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.states import Status, join_states, select_poses
@@ -90,12 +85,12 @@ def _linearize(robot: Mechanism, state: State) -> list[_Rows]:
     """Return the equations at the poses of a state (1, n), at the nominal values."""
     program, nominal = robot.program, robot.parameters.nominal[None]
     blocks, slopes = (
-        linearize_state(robot, state, nominal),
-        differentiate_displacements(robot, nominal),
+        limb_rows.linearize_state(robot, state, nominal),
+        limb_rows.differentiate_displacements(robot, nominal),
     )
-    both, M = stack_scaled_rows(robot, blocks)[0], len(program.unknown_twists)
-    _, (E,), limb = stack_limb_rows(program, blocks, slopes)
-    _, (absorbed,), _ = stack_limb_rows(program, blocks, slopes, passive=True)
+    both, M = limb_rows.stack_scaled_rows(robot, blocks)[0], len(program.unknown_twists)
+    _, (E,), limb = limb_rows.stack_limb_rows(program, blocks, slopes)
+    _, (absorbed,), _ = limb_rows.stack_limb_rows(program, blocks, slopes, passive=True)
     return [_Rows(own[:, :M], own, E[i], limb, absorbed[i]) for i, own in enumerate(both)]
 
 

@@ -19,6 +19,7 @@ from loopcal import engine, geometry
 from loopcal.engine import NEAR_GOAL, State
 from loopcal.errors import DataError
 from loopcal.findings import Finding, report_finding
+from loopcal.mechanism import kinematics
 from loopcal.mechanism.assembly import AXES, TWIST_UNITS
 from loopcal.mechanism.chains import split_stage_states
 from loopcal.mechanism.inverse import (
@@ -27,14 +28,6 @@ from loopcal.mechanism.inverse import (
     determine_platform,
     find_nearest_reachable,
     moves_by_drives,
-)
-from loopcal.mechanism.kinematics import (
-    Loops,
-    clear_sign,
-    compute_closure_sign,
-    compute_readings,
-    forward_trials,
-    load_readings,
 )
 from loopcal.mechanism.limb_rows import name_passive_joints
 from loopcal.mechanism.model import Mechanism, describe_gap
@@ -244,7 +237,7 @@ def judge_modes(
         return _judge_stages(robot, state, begin)
     if robot.is_serial:
         return state, np.zeros(state.T.shape[1], bool)
-    begin, n = clear_sign(robot, begin), state.T.shape[1]
+    begin, n = kinematics.clear_sign(robot, begin), state.T.shape[1]
     closed = state.status[0] == Status.CONVERGED
     if arrives is not None:
         sign, is_sure = state.closure_sign[0], arrives
@@ -258,7 +251,7 @@ def judge_modes(
             sign = np.where(is_sure, sign, state.closure_sign[0])
         elif not is_sure.all():
             unsure = select_poses(state, ~is_sure)
-            sign[~is_sure] = compute_closure_sign(robot, robot.values[None], unsure)[0]
+            sign[~is_sure] = kinematics.compute_closure_sign(robot, robot.values[None], unsure)[0]
         state = replace(state, closure_sign=sign[None])
     is_other = closed & (sign != begin.closure_sign[0])
     # limbs that are closed one by one at a pose may have several readings there
@@ -294,7 +287,7 @@ def _judge_paths(robot: Mechanism, first: State, goal: State) -> tuple[State, Bo
     Newton's method must lead to the pose of a goal from its readings, and a safe path too, where
     readings determine the joints.
     """
-    loops = Loops.place(robot)
+    loops = kinematics.Loops.place(robot)
     back = loops.close(loops.read(goal), first, goal=goal)
     is_other = back.status[0] != NEAR_GOAL
     if is_other.any():
@@ -431,14 +424,16 @@ def forward(robot: Mechanism, q: ArrayLike, start: Solution | None = None) -> So
         readings[:, commanded] = known
         if robot.is_elastic:
             wrench = np.array(robot.assembly.load.wrench)
-            readings = load_readings(robot, robot.values[None], readings[None], wrench)[0]
+            readings = kinematics.load_readings(robot, robot.values[None], readings[None], wrench)[
+                0
+            ]
     if readings.ndim != 2 or readings.shape[1] not in (a, 2 * a):
         raise DataError(
             f"{readings.shape[-1]} readings a row do not fit: {robot.name} has {a} actuators "
             f"({', '.join(actuator.name for actuator in robot.actuators)}). Give one reading for "
             "each"
         )
-    state = forward_trials(robot, robot.values[None], readings[None], begin)
+    state = kinematics.forward_trials(robot, robot.values[None], readings[None], begin)
     return make_solution(robot, state, readings[:, :a])
 
 
@@ -491,7 +486,7 @@ def inverse(robot: Mechanism, target: ArrayLike, start: Solution | None = None) 
         state = solve_in_mode(robot, partial(reach_coordinates, robot), coordinates, begin)
     else:
         raise DataError(f"a target has the shape {wanted.shape}. Allowed: {shapes}")
-    q = compute_readings(robot, values, state)[0]
+    q = kinematics.compute_readings(robot, values, state)[0]
     lost = (state.status == Status.CONVERGED) & ~np.isfinite(q).all(axis=-1)
     status = np.where(lost, np.int8(Status.UNREACHABLE), state.status)
     return make_solution(robot, replace(state, status=status), q)
@@ -635,5 +630,7 @@ def differentiate_by_coordinates(robot: Mechanism, values: FloatArray, state: St
     names, flat = robot.controlled, state.T.reshape(-1, 4, 4)
     columns = differentiate_coordinates(flat, names, robot.size)
     columns = columns.reshape(*state.T.shape[:2], len(names), 6)
-    D = differentiate_pose(robot, values, compute_readings(robot, values, state), state).readings
+    D = differentiate_pose(
+        robot, values, kinematics.compute_readings(robot, values, state), state
+    ).readings
     return np.matmul(D, np.linalg.pinv(np.nan_to_num(np.matmul(columns, D))))

@@ -17,15 +17,10 @@ import numpy as np
 
 from loopcal.errors import MechanismError
 from loopcal.findings import Finding, report_finding
+from loopcal.mechanism import workspace
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import list_dimensions
 from loopcal.mechanism.solutions import Solution, inverse
-from loopcal.mechanism.workspace import (
-    MIN_DRAWS,
-    MIN_REACHABLE_SHARE,
-    draw_coordinates,
-    workspace_ranges,
-)
 from loopcal.planning.constraints import (
     ConstraintChecker,
     Constraints,
@@ -74,17 +69,19 @@ def draw_candidates(
 ) -> Candidates:
     """Draw about `count` allowed poses from the workspace, half of them at its boundary."""
     rng = np.random.default_rng(seed)
-    checker, bounds = _build_home_checker(robot, constraints), workspace_ranges(robot)
+    checker, bounds = _build_home_checker(robot, constraints), workspace.workspace_ranges(robot)
     excluded: Counter[Violation] = Counter()
     wanted, batches, kept, n_drawn = count - count // 2, [], 0, 0
     while kept < wanted:
         number = wanted if not kept else max(wanted - kept, wanted // 10, 1)
-        poses = round_coordinates(robot, draw_coordinates(rng, robot.controlled, bounds, number))
+        poses = round_coordinates(
+            robot, workspace.draw_coordinates(rng, robot.controlled, bounds, number)
+        )
         check = checker.check_poses(inverse(robot, poses))
         excluded.update(check.count_violations())
         batches.append(poses[check.allowed])
         kept, n_drawn = kept + len(batches[-1]), n_drawn + len(poses)
-        if n_drawn >= MIN_DRAWS and kept < MIN_REACHABLE_SHARE * n_drawn:
+        if n_drawn >= workspace.MIN_DRAWS and kept < workspace.MIN_REACHABLE_SHARE * n_drawn:
             counts = {"allowed": kept, "total": n_drawn, "reasons": list_reasons(excluded)}
             raise MechanismError.of("plan.workspace-excluded", robot=robot.name, **counts)
     inside = np.concatenate(batches)
@@ -159,7 +156,7 @@ def _draw_boundary(
     robot, names = checker.robot, checker.robot.controlled
     low, high = np.array([bounds[name] for name in names]).T
     full = np.isclose(high - low, 2.0 * np.pi)
-    poses = draw_coordinates(rng, names, bounds, count)
+    poses = workspace.draw_coordinates(rng, names, bounds, count)
     end = rng.random((count, len(names))) < 0.5
     put = (rng.random((count, len(names))) < ON_BOUNDARY) & ~full
     if not full.all():  # at least one coordinate is at an end, unless none has an end

@@ -35,22 +35,9 @@ from loopcal.mechanism.solutions import Solution, inverse
 from loopcal.mechanism.workspace import sample_workspace
 from loopcal.numerics.decomposition import Decomposition, are_nonzero, intersect_spaces
 from loopcal.numerics.statistics import compute_weighted_quantile
-from loopcal.planning import pose_groups
+from loopcal.planning import design_space, pose_groups
 from loopcal.planning.candidates import Candidates, check_listed_poses, draw_candidates
 from loopcal.planning.constraints import N_POSES, Constraints, PlanOptions, Target
-from loopcal.planning.design_space import (
-    Criterion,
-    DesignProblem,
-    ObservableSpace,
-    PriorInformation,
-    divide_by_factor,
-    factor_design,
-    factor_rows,
-    factor_square,
-    find_observable_space,
-    is_allowed,
-    is_full_rank,
-)
 from loopcal.planning.exchange import Design, compute_design_curve, find_smallest_design
 from loopcal.results.description import Field, fields
 from loopcal.typing import FloatArray, IntArray, Progress, report_no_progress
@@ -89,17 +76,19 @@ class Prediction:
     @cached_property
     def position(self) -> FloatArray:
         """Factor (q, p) of the rows of all positions [m]."""
-        return factor_rows(self.displacements.reshape(-1, self.displacements.shape[2]))
+        return design_space.factor_rows(self.displacements.reshape(-1, self.displacements.shape[2]))
 
     @cached_property
     def orientation(self) -> FloatArray:
         """Factor (q, p) of the rows of all orientations [rad]."""
-        return factor_rows(self.rotations.reshape(-1, self.rotations.shape[2]))
+        return design_space.factor_rows(self.rotations.reshape(-1, self.rotations.shape[2]))
 
     @cached_property
     def pose(self) -> FloatArray:
         """Factor (q, p) of the rows of all poses [m], rotations times size."""
-        return factor_rows(np.concatenate([self.size * self.orientation, self.position]))
+        return design_space.factor_rows(
+            np.concatenate([self.size * self.orientation, self.position])
+        )
 
 
 def linearize_prediction(
@@ -172,7 +161,7 @@ class PlanningProblem:
     options: PlanOptions  # of the plan
     candidates: Candidates  # poses that may be measured
     groups: pose_groups.GroupRows  # their rows
-    prior: PriorInformation  # information before the first new pose
+    prior: design_space.PriorInformation  # information before the first new pose
     observable: Decomposition  # decomposition of all candidates together, without spreads
     prediction: Prediction  # of the tool's pose over the workspace
     n_earlier_equations: int = 0  # of measurements made already, less their own nuisance parameters
@@ -184,9 +173,9 @@ class PlanningProblem:
         return self.free.robot
 
     @cached_property
-    def space(self) -> ObservableSpace:
+    def space(self) -> design_space.ObservableSpace:
         """The directions in which designs are compared."""
-        return find_observable_space(self.groups.rows, self.prior)
+        return design_space.find_observable_space(self.groups.rows, self.prior)
 
     @property
     def poses_per_group(self) -> int:
@@ -201,7 +190,7 @@ class PlanningProblem:
     @property
     def n_candidates(self) -> int:
         """Number of groups that may be chosen."""
-        return int(is_allowed(self.groups.rows).sum())
+        return int(design_space.is_allowed(self.groups.rows).sum())
 
     @cached_property
     def n_unknowns(self) -> int:
@@ -223,11 +212,11 @@ class PlanningProblem:
         missing = self.n_unknowns - self.n_earlier_equations
         return max(-(-missing // self.groups.rows.shape[1]), 1)
 
-    def build_criterion(self, name: str | None = None) -> Criterion:
+    def build_criterion(self, name: str | None = None) -> design_space.Criterion:
         """Return criterion D, or I for the target; by default the criterion of the options."""
         name, target = name or self.options.criterion, self.options.target
         if name == "D":
-            return Criterion("D")
+            return design_space.Criterion("D")
         rows, scale = getattr(self.prediction, target), 1.0
         if target == "orientation":
             scale = self.prediction.size
@@ -236,30 +225,36 @@ class PlanningProblem:
             raise EstimationError.of(
                 "plan.target-unobservable", robot=self.robot.name, target=target
             )
-        return Criterion("I", rows, len(self.prediction))
+        return design_space.Criterion("I", rows, len(self.prediction))
 
-    def pose_design(self, rows: FloatArray | None = None, name: str | None = None) -> DesignProblem:
+    def pose_design(
+        self, rows: FloatArray | None = None, name: str | None = None
+    ) -> design_space.DesignProblem:
         """Return the choice of groups by a criterion of this name; by default from all rows."""
         rows = self.groups.rows if rows is None else rows
-        return DesignProblem(rows, self.build_criterion(name), self.prior, counted=self.counted)
+        return design_space.DesignProblem(
+            rows, self.build_criterion(name), self.prior, counted=self.counted
+        )
 
     def predict_errors(self, chosen: IntArray, noise: float = 1.0) -> ExpectedErrors | None:
         """Return the errors expected after measuring groups (n,) with so many times the stated
         noise; None if unbounded.
         """
         if len(chosen):
-            factor = factor_design(self.groups.rows[chosen] / noise, self.prior, self.space)
+            factor = design_space.factor_design(
+                self.groups.rows[chosen] / noise, self.prior, self.space
+            )
         else:
             # no row of the prior has both nuisance and machine columns, see `combine_prior`
             rows = self.prior.rows[:, self.prior.n_nuisance :] @ self.space.machine
-            factor = factor_square(rows)
+            factor = design_space.factor_square(rows)
         s = np.linalg.svd(factor, compute_uv=False)
-        if not is_full_rank(s):
+        if not design_space.is_full_rank(s):
             return None
         share, errors = self.options.share, dict[str, float]()
         for target in DIMENSIONS:
             L = getattr(self.prediction, target) @ self.space.machine
-            s = np.linalg.svd(divide_by_factor(L, factor), compute_uv=False)
+            s = np.linalg.svd(design_space.divide_by_factor(L, factor), compute_uv=False)
             squares = s**2 / len(self.prediction)  # the error is their sum for unit variances
             errors[target] = float(np.sqrt(compute_weighted_quantile(squares, share)))
             errors[f"{target}_rms"] = float(np.sqrt(squares.sum()))

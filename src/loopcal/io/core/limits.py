@@ -17,13 +17,7 @@ from typing import Any, NamedTuple
 
 from loopcal.errors import FileError
 from loopcal.findings import Finding, report_finding
-from loopcal.mechanism.assembly import (
-    MOST_ACTUATORS,
-    MOST_COPIES,
-    MOST_JOINTS,
-    MOST_LIMBS,
-    MOST_PARAMETERS,
-)
+from loopcal.mechanism import assembly
 from loopcal.plain_text import escape, find_not_plain, name_character, quote
 
 MEGABYTE = 10**6
@@ -98,11 +92,13 @@ YAML_DEPTH = FileLimit(
     "levels of nesting",
     "write it with fewer levels",
 )
-COPIES = FileLimit("`copies: {count: ..}` of a limb", MOST_COPIES, "copies")
-LIMBS = FileLimit("limbs of a robot, copies included", MOST_LIMBS, "limbs")
-JOINTS = FileLimit("joints of a limb (a universal joint: two)", MOST_JOINTS, "joints")
-ACTUATORS = FileLimit("actuators of all limbs together", MOST_ACTUATORS, "actuators")
-PARAMETERS = FileLimit("parameters of a robot, fixed ones included", MOST_PARAMETERS, "parameters")
+COPIES = FileLimit("`copies: {count: ..}` of a limb", assembly.MOST_COPIES, "copies")
+LIMBS = FileLimit("limbs of a robot, copies included", assembly.MOST_LIMBS, "limbs")
+JOINTS = FileLimit("joints of a limb (a universal joint: two)", assembly.MOST_JOINTS, "joints")
+ACTUATORS = FileLimit("actuators of all limbs together", assembly.MOST_ACTUATORS, "actuators")
+PARAMETERS = FileLimit(
+    "parameters of a robot, fixed ones included", assembly.MOST_PARAMETERS, "parameters"
+)
 NAME_LENGTH = FileLimit(
     "names, and every other text of a YAML file", 200, "characters", "shorten it"
 )

@@ -17,14 +17,7 @@ import numpy as np
 
 from loopcal import engine, geometry
 from loopcal.errors import DataError
-from loopcal.measure.array_checks import (
-    check_array,
-    check_names,
-    check_point,
-    check_pose,
-    drop_repeats,
-    set_fields,
-)
+from loopcal.measure import array_checks
 from loopcal.measure.kinds import setup_parameters as setup
 from loopcal.measure.kinds.kind import (
     POSITION_COLUMNS,
@@ -79,7 +72,7 @@ class TargetKind(Kind):
 
     targets: tuple[str, ...] = ("target",)
     places: FloatArray | None = None
-    T_base_frame: FloatArray = checked(check_pose, "T_base_frame", np.eye(4))
+    T_base_frame: FloatArray = checked(array_checks.check_pose, "T_base_frame", np.eye(4))
     unknown: tuple[str, ...] = ()
     frame: str = "frame"
     of: str = ""
@@ -89,8 +82,8 @@ class TargetKind(Kind):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        targets = check_names(self.targets, "targets")
-        set_fields(self, targets=targets)
+        targets = array_checks.check_names(self.targets, "targets")
+        array_checks.set_fields(self, targets=targets)
         shape = (len(targets), 3)
         if self.places is not None:
             is_single_place = len(self.places) > 0 and np.ndim(self.places[0]) == 0
@@ -100,14 +93,16 @@ class TargetKind(Kind):
                     f"the number of places is {len(places)}, but there are {len(targets)} targets "
                     f"({', '.join(targets)}). Give one place [x, y, z] for each target"
                 )
-            set_fields(self, places=check_array(places, "the places of the targets", shape))
+            array_checks.set_fields(
+                self, places=array_checks.check_array(places, "the places of the targets", shape)
+            )
         elif self.is_of_base and "targets" not in self.unknown:
             raise DataError(
                 f"the places of {', '.join(targets)} on the base are neither given nor unknown. "
                 "Give `places` in the base frame, or list targets in `unknown`"
             )
         elif self.is_of_base:
-            set_fields(self, places=np.zeros(shape))
+            array_checks.set_fields(self, places=np.zeros(shape))
 
     def with_tool(self, T_platform_tool: FloatArray) -> Self:
         """Return the kind with its targets at the origin of the tool, or of the stage's platform,
@@ -182,7 +177,7 @@ class TargetKind(Kind):
         p = self._stated_places() if places is None else places.reshape(*places.shape[:-1], k, 3)
         if isinstance(T, np.ndarray) and T.ndim == 4 and values.ndim == 3:  # no jax in tests
             points = p if p.ndim == 4 else p[None, None]
-            given = drop_repeats(T), self.T_base_frame, of_frame, points, self._columns
+            given = array_checks.drop_repeats(T), self.T_base_frame, of_frame, points, self._columns
             if (located := engine.locate_points(*given)) is not None:
                 return located
         frame = setup.place_frame(self.T_base_frame, of_frame)
@@ -248,7 +243,7 @@ class Position(TargetKind):
         counts; default: its origin.
     """
 
-    station: FloatArray | None = checked(check_point, "the station")
+    station: FloatArray | None = checked(array_checks.check_point, "the station")
 
     name: ClassVar[str] = "position"
     length_error: ClassVar[str] = "position"
