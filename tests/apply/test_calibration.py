@@ -225,9 +225,9 @@ def test_progress_is_reported_from_zero_to_the_total(unvalidated):
 
 
 REFUSED = {
-    "load_robot": lambda: calibrate("hexapod.yaml", "data.csv"),
-    "load_measurements": lambda: calibrate(hexapod(), "data.csv"),
-    "CalibrationOptions": lambda: calibrate(hexapod(), hexapod_data(4), 0.25),
+    "load_robot": lambda: lc.calibrate("hexapod.yaml", "data.csv"),
+    "load_measurements": lambda: lc.calibrate(hexapod(), "data.csv"),
+    "CalibrationOptions": lambda: lc.calibrate(hexapod(), hexapod_data(4), 0.25),
     "workflow.free-limb-needs-prior": lambda: CalibrationOptions(free_limb="leg3"),
     "hold_out is 1, which is not a share": lambda: CalibrationOptions(hold_out=1.0),
     "Give one of the two": lambda: CalibrationOptions(hold_out=0.25, held_out=("1",)),
