@@ -149,7 +149,7 @@ def force(what: str, more: str = "") -> Any:
 
 def seed(what: str, of: str) -> Any:
     """Declare the option for the seed of something random, which a function `of` makes."""
-    return option(f"Seed of {what}.", of=of, type=Whole(min=0), metavar="N")
+    return option(f"Seed of {what}.", of=of, type=Count(least=0), metavar="N")
 
 
 # Types of values
@@ -244,20 +244,16 @@ SHARE, OPEN_SHARE = (NumberRange(0, 1, is_open, is_open) for is_open in (False, 
 SHARE.name = OPEN_SHARE.name = "share"
 
 
-class Whole(click.IntRange):
-    """A whole number within a range."""
-
-    name = "integer"
-
-
-class Count(Whole):
+class Count(click.IntRange):
     """A whole number on the command line, up to a limit of `loopcal.io.core.limits`, which is given
     by its name, so that it is only imported when the option is used; without `least`, the command
     itself refuses small ones.
     """
 
-    def __init__(self, limit: str, least: int | None = None) -> None:
-        super().__init__(min=least)
+    name = "integer"
+
+    def __init__(self, limit: str = "", least: int | None = None, most: int | None = None) -> None:
+        super().__init__(min=least, max=most)
         self.limit = limit
 
     def get_metavar(self, param: click.Parameter, ctx: click.Context | None = None) -> str:
@@ -272,8 +268,8 @@ class Count(Whole):
         """Return the number, or fail with what is allowed."""
         from loopcal.io.core import limits
 
-        number, limit = super().convert(value, param, ctx), getattr(limits, self.limit)
-        if number > limit.most:
+        number, limit = super().convert(value, param, ctx), getattr(limits, self.limit, None)
+        if limit is not None and number > limit.most:
             self.fail(f"the limit is {limit}. Give a smaller number.", param, ctx)
         return int(number)
 
@@ -625,7 +621,7 @@ FIT: Any = Group(
     ),
     keep=option(
         "For truncated-svd: number of directions. Default: by cross-validation.",
-        type=Whole(min=0),
+        type=Count(least=0),
         metavar="K",
     ),
     noise=option(

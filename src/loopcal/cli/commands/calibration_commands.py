@@ -255,7 +255,7 @@ def check_up(
     false_alarms: float = opt.option(
         "Probability of any false alarm in a year.", of=CHECK_UP, type=opt.OPEN_SHARE
     ),
-    a_year: int = opt.option("Number of checks in a year.", of=CHECK_UP, type=opt.Whole(1)),
+    a_year: int = opt.option("Number of checks in a year.", of=CHECK_UP, type=opt.Count(least=1)),
     refit: tuple[str, ...] = opt.option(
         "Target or surface that moved since RUN, which each check determines. Repeatable.",
         multiple=True,

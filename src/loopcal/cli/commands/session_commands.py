@@ -136,7 +136,9 @@ def app(
     host: str = opt.option(
         "Address to listen on, such as 0.0.0.0 for a tablet.", default="127.0.0.1"
     ),
-    port: int = opt.option("Port.  [default: a free one]", default=0, type=opt.Whole(0, 65535)),
+    port: int = opt.option(
+        "Port.  [default: a free one]", default=0, type=opt.Count(least=0, most=65535)
+    ),
     keep: Path | None = opt.path(
         "Folder that keeps the files, new or to go on with.", metavar="DIR"
     ),
