@@ -117,7 +117,7 @@ def _list_quantities(series: Sequence[ResidualSeries]) -> list[str]:
 SIGMAS = "residual [sigma]"  # label of an axis of whitened residuals
 # Residuals over sigma that 95 % do not exceed, if the stated noise is right.
 BAND = 1.959963984540054
-MANY = 2000  # points of a series from which they are embedded as a picture in SVG and PDF files
+MANY = 2000  # points of all series from which they are embedded as a picture in SVG and PDF files
 
 UPRIGHT, COLUMNS = 8, 3
 """Components up to which their numbers fit side by side, and panels of quantities in a row."""
@@ -168,7 +168,7 @@ def draw_residual_rows(
         symbol = units[name].symbol if name in units else "s" if name == "time" else "degC"
         label_sparsely(axes.xaxis, 5, is_whole=False)
         for s in (s for s in measured if name in s.quantities):
-            _plot(axes, s.quantities[name] / factor, s.whitened, styles[s.label])
+            axes.plot(s.quantities[name] / factor, s.whitened, **styles[s.label])
         _add_band(axes)
         label_axes(axes, f"{name} [{symbol}]", SIGMAS)
     add_legend(figure)
@@ -180,6 +180,7 @@ def draw_residual_rows(
 
 def _choose_styles(series: Sequence[ResidualSeries]) -> Styles:
     """Return label, color and marker of each series; they differ in both up to eight series."""
+    is_large = sum(len(s.raw) for s in series) > MANY
     return {
         label: {
             "label": label,
@@ -189,13 +190,10 @@ def _choose_styles(series: Sequence[ResidualSeries]) -> Styles:
             "ms": DOT,
             "mfc": "none" if i >= len(COLORS) else COLORS[i % len(COLORS)],
             "mew": 0.7,
+            "rasterized": is_large,
         }
         for i, label in enumerate(dict.fromkeys(s.label for s in series))
     }
-
-
-def _plot(axes: Axes, x: np.ndarray, y: FloatArray, style: Mapping[str, Any]) -> None:
-    axes.plot(x, y, rasterized=len(y) > MANY, **style)
 
 
 def _draw_by_pose(
@@ -204,7 +202,7 @@ def _draw_by_pose(
     """Draw the residuals of one kind in units; components are side by side at their pose."""
     steps = np.linspace(-0.25, 0.25, len(group) + 2)[1:-1] if len(poses) <= 60 else [0.0] * 99
     for s, step in zip(group, steps, strict=False):
-        _plot(axes, s.poses + step, s.raw / unit.factor_to_si, styles[s.label])
+        axes.plot(s.poses + step, s.raw / unit.factor_to_si, **styles[s.label])
     axes.axhline(0.0, **ZERO, zorder=1)
     label_axes(axes, "", f"{group[0].kind} residual [{unit.symbol}]", "by pose")
     label_poses(axes, poses)
@@ -216,7 +214,7 @@ def _draw_components(axes: Axes, series: Sequence[ResidualSeries], styles: Style
     for i, (label, style) in enumerate(styles.items()):
         values = np.concatenate([s.whitened for s in series if s.label == label])
         spread = np.linspace(-0.22, 0.22, len(values)) if len(values) > 1 else np.zeros(len(values))
-        _plot(axes, i + spread, values, style)
+        axes.plot(i + spread, values, **style)
         size = float(np.sqrt((values**2).mean()))
         for sign in (-1.0, 1.0):
             axes.hlines(sign * size, i - 0.38, i + 0.38, color=DARK, lw=LINE)
@@ -246,7 +244,8 @@ def _draw_normal_plot(axes: Axes, whitened: FloatArray) -> None:
     """Draw the sorted residuals over sigma against the quantiles of a normal distribution."""
     values = np.sort(whitened)
     x = normal_quantile((np.arange(len(values)) + 0.5) / max(len(values), 1))
-    _plot(axes, x, values, {"marker": "o", "ls": "none", "color": COLORS[0], "ms": DOT - 0.5})
+    how = {"ls": "none", "color": COLORS[0], "ms": DOT - 0.5, "rasterized": len(x) > MANY}
+    axes.plot(x, values, marker="o", **how)
     if len(values):
         axes.plot(x[[0, -1]], x[[0, -1]], color=DARK, lw=LINE)
     label_axes(axes, "normal quantile [sigma]", SIGMAS, "normal plot, line: given noise")
