@@ -465,8 +465,9 @@ def _find_home(robot: Mechanism) -> State:
 
 
 def _refuse_singular_start(robot: Mechanism, target: FloatArray) -> None:
-    """Refuse `start:` values from which home is not found, where it is from others beside them: at
-    the stated ones the limbs are in a singular position. The error proposes those of home.
+    """Refuse `start:` values, or a home pose, from which home is not found, where it is from others
+    beside them: at the stated ones limbs or platform are in a singular position. The error proposes
+    those of home: values of joints, and coordinates of the platform that are not controlled.
     """
     guess, values = robot.home_state, robot.values[None]
     freedoms, twist = list(robot.program.freedoms), np.zeros(6)
