@@ -92,7 +92,7 @@ def find_results(name: str, names: Collection[str]) -> tuple[str, ...]:
     signature = inspect.signature(value)
     options = signature.parameters.get("options")
     annotations = [options.annotation if options else "", signature.return_annotation]
-    found = [str(annotation).removesuffix(" | None") for annotation in annotations]
+    found = [str(a).removesuffix(" | None").rpartition(".")[2] for a in annotations]
     return tuple(result for result in found if result in names)
 
 
