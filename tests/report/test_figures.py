@@ -124,6 +124,24 @@ def test_missing_components_and_rows_of_weight_zero_are_not_drawn(five_bar) -> N
     check(draw_residuals(changed))
 
 
+def test_components_of_many_targets_share_labels_and_all_are_drawn(five_bar) -> None:
+    rows, *_ = five_bar.fit.residuals
+    raw = np.tile(rows.raw[:, :1], (1, 120))
+    whole = replace(
+        rows,
+        components=tuple(f"t{i // 3}.{'xyz'[i % 3]}" for i in range(120)),
+        dimensions=rows.dimensions[:1] * 120,
+        **dict.fromkeys(("raw", "whitened", "measured"), raw),
+    )
+    figure = draw_residuals(replace(five_bar.fit, residuals=(whole,)))
+    by_pose, by_component, *_ = figure.axes
+    labels = [label.get_text() for label in by_component.get_xticklabels()]
+    assert labels == [f"{rows.kind} {axis}" for axis in "xyz"]
+    drawn = [line for line in by_pose.lines if len(np.atleast_1d(line.get_xdata())) == len(raw)]
+    assert len(drawn) == 120
+    assert all(line.get_rasterized() == (raw.size > 2000) for line in drawn)
+
+
 def test_residuals_against_time_and_temperature_that_were_recorded(five_bar) -> None:
     rows = five_bar.fit.residuals[0]
     n = len(rows.raw)

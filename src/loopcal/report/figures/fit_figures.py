@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -119,8 +119,8 @@ SIGMAS = "residual [sigma]"  # label of an axis of whitened residuals
 BAND = 1.959963984540054
 MANY = 2000  # points of all series from which they are embedded as a picture in SVG and PDF files
 
-UPRIGHT, COLUMNS = 8, 3
-"""Components up to which their numbers fit side by side, and panels of quantities in a row."""
+UPRIGHT, LABELED, COLUMNS = 8, 30, 3
+"""Components whose numbers fit side by side, that are named by target, and panels in a row."""
 
 
 @register("figure residuals", Identification)
@@ -141,6 +141,8 @@ def draw_residual_rows(
     residuals : of a fit or of a run folder. setup : names of the fitted setup parameters.
     """
     series = [s for s in list_series(robot, residuals) if len(s.raw)]
+    if len(series) > LABELED:
+        series = [replace(s, component=s.component.rpartition(".")[2]) for s in series]
     styles, quantities = _choose_styles(series), _list_quantities(series)
     poses = _list_poses(residuals)
     groups: dict[tuple[str, Dimension], list[ResidualSeries]] = {}
@@ -200,8 +202,8 @@ def _draw_by_pose(
     axes: Axes, unit: Unit, poses: Sequence[str], group: Sequence[ResidualSeries], styles: Styles
 ) -> None:
     """Draw the residuals of one kind in units; components are side by side at their pose."""
-    steps = np.linspace(-0.25, 0.25, len(group) + 2)[1:-1] if len(poses) <= 60 else [0.0] * 99
-    for s, step in zip(group, steps, strict=False):
+    reach = 0.25 if len(poses) <= 60 else 0.0
+    for s, step in zip(group, np.linspace(-reach, reach, len(group) + 2)[1:-1], strict=True):
         axes.plot(s.poses + step, s.raw / unit.factor_to_si, **styles[s.label])
     axes.axhline(0.0, **ZERO, zorder=1)
     label_axes(axes, "", f"{group[0].kind} residual [{unit.symbol}]", "by pose")
@@ -244,8 +246,7 @@ def _draw_normal_plot(axes: Axes, whitened: FloatArray) -> None:
     """Draw the sorted residuals over sigma against the quantiles of a normal distribution."""
     values = np.sort(whitened)
     x = normal_quantile((np.arange(len(values)) + 0.5) / max(len(values), 1))
-    how = {"ls": "none", "color": COLORS[0], "ms": DOT - 0.5, "rasterized": len(x) > MANY}
-    axes.plot(x, values, marker="o", **how)
+    axes.plot(x, values, "o", color=COLORS[0], ms=DOT - 0.5, rasterized=len(x) > MANY)
     if len(values):
         axes.plot(x[[0, -1]], x[[0, -1]], color=DARK, lw=LINE)
     label_axes(axes, "normal quantile [sigma]", SIGMAS, "normal plot, line: given noise")
