@@ -35,19 +35,10 @@ from loopcal.diagnose.residual_patterns import CAUSE, POSE, linearize_examined
 from loopcal.diagnose.value_comparison import compare_with_values
 from loopcal.engine import collect_versions
 from loopcal.errors import DataError, EstimationError
-from loopcal.estimate.determinable_setup import (
-    fix_undetermined_setup,
-    report_equal_setup,
-    report_fixed_setup,
-)
+from loopcal.estimate import determinable_setup, information
 from loopcal.estimate.fit_linearization import FitLinearization
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.identification import exclude_poses, identify
-from loopcal.estimate.information import (
-    count_equations,
-    has_equations_to_spare,
-    list_instrument_frames,
-)
 from loopcal.estimate.penalties import LeastSquares
 from loopcal.estimate.posterior import DISCREPANCY
 from loopcal.estimate.prior import refuse_reused_rows
@@ -118,8 +109,8 @@ def calibrate(
     <Verdict.CALIBRATED: 'calibrated'>
     """
     options = CalibrationOptions() if options is None else options
-    data = fix_undetermined_setup(robot, data)
-    instruments = (name for name, *_ in list_instrument_frames(data))
+    data = determinable_setup.fix_undetermined_setup(robot, data)
+    instruments = (name for name, *_ in information.list_instrument_frames(data))
     check_choice("frame", options.frame, (FITTED, BASE, RELATIVE, *instruments))
     if options.volume is not None:  # before the fit: what the nominal robot does not reach
         next(as_volume(options.volume).list_grids(robot))
@@ -248,11 +239,11 @@ def _fit(
             left_out = choice.finding.data["not_compared"]
             raise DataError.of("workflow.no-parameter-chosen", not_compared=left_out)
     chosen = robot if choice is None else choice.robot
-    free, available = int(chosen.parameters.free.sum()), count_equations(chosen, data)
+    free, available = int(chosen.parameters.free.sum()), information.count_equations(chosen, data)
     if fit_options.method is None and available < free:
         problem = problem_of(select_free_parameters(chosen), data)
         z = problem.free.deviation(chosen.values[None])
-        if not has_equations_to_spare(problem, z, LeastSquares()):
+        if not information.has_equations_to_spare(problem, z, LeastSquares()):
             from loopcal.diagnose.identifiable_parameters import describe_missing_equations
 
             missing = describe_missing_equations(chosen, data) or ""
@@ -331,9 +322,9 @@ def _report(
         *of_volume,
         *([report_finding("workflow.held-out-repeats", names=repeats)] if repeats else []),
         *calibration_report.report_freedoms(fit, fitted),
-        *report_fixed_setup(fitted),
+        *determinable_setup.report_fixed_setup(fitted),
         *error_causes.report_picture_scale(fit.robot, fitted),
-        *(report_equal_setup(fit, fitted) if fit.converged else ()),
+        *(determinable_setup.report_equal_setup(fit, fitted) if fit.converged else ()),
         *calibration_report.report_heights(fit, fitted, heights),
         *report_base_targets(fitted),
         start.finding,

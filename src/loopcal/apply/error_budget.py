@@ -18,15 +18,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from loopcal.diagnose.error_frames import (
-    BASE,
-    FITTED,
-    RELATIVE,
-    ToolErrors,
-    compute_mean_squares,
-    linearize_tool_errors,
-    locate_measured_poses,
-)
+from loopcal.diagnose import error_frames
 from loopcal.diagnose.fit_examination import ROUNDING
 from loopcal.errors import MechanismError
 from loopcal.estimate.fit_linearization import (
@@ -611,7 +603,7 @@ class ErrorBudget(DrawnResult):
 def compute_error_budget(
     fit: Identification,
     data: Measurements,
-    frame: str = FITTED,
+    frame: str = error_frames.FITTED,
     linear: FitLinearization | None = None,
 ) -> ErrorBudget | None:
     """Return the uncertainty budget of a calibrated machine; None where the fit has no intervals,
@@ -628,12 +620,12 @@ def compute_error_budget(
         drawn = sample_workspace(fit.robot, POSES, SEED).solution
         solution = drawn.take(np.flatnonzero(drawn.converged))
     except MechanismError:  # the robot states no workspace
-        solution, is_workspace = locate_measured_poses(fit, linear.data, POSES), False
+        solution, is_workspace = error_frames.locate_measured_poses(fit, linear.data, POSES), False
     if not len(solution.q):
         return None
-    effects = linearize_tool_errors(fit.posterior, solution, frame)
+    effects = error_frames.linearize_tool_errors(fit.posterior, solution, frame)
     split = split_covariance(linear)
-    lines = _list_sources(fit, split, effects, is_relative=frame == RELATIVE)
+    lines = _list_sources(fit, split, effects, is_relative=frame == error_frames.RELATIVE)
     sd = np.sqrt(sum(line.parameters for line in lines))
     sd = np.where(split.undetermined, np.inf, sd)
     given = lines, solution, frame, effects
@@ -650,7 +642,11 @@ def compute_error_budget(
 
 
 def _list_sources(
-    fit: Identification, split: CovarianceSplit, effects: ToolErrors, *, is_relative: bool
+    fit: Identification,
+    split: CovarianceSplit,
+    effects: error_frames.ToolErrors,
+    *,
+    is_relative: bool,
 ) -> list[SourceBudget]:
     """Return every source with its variances.
 
@@ -670,13 +666,13 @@ def _list_sources(
         if source.kind == SETUP and not is_relative:
             twists = np.concatenate([twists, effects.by_frame], axis=2)
         variances = np.where(split.undetermined, np.nan, (root**2).sum(axis=1))
-        angle, position = compute_mean_squares(twists)
+        angle, position = error_frames.compute_mean_squares(twists)
         lines.append(SourceBudget(source, position, angle, variances, None))
     repeated = effects.by_readings
     if is_relative:
         repeated = np.concatenate([repeated, effects.by_frame], axis=2)
     if repeated.any():
-        angle, position = compute_mean_squares(repeated)
+        angle, position = error_frames.compute_mean_squares(repeated)
         nothing = np.where(split.undetermined, np.nan, 0.0)
         size = _find_drive_size(fit.robot, fit.posterior.repeatability)
         source = Source(REPEATABILITY, "", "B", np.inf, size, size and size.value)
@@ -691,14 +687,14 @@ def _halve(
     lines: list[SourceBudget],
     solution: Solution,
     frame: str,
-    effects: ToolErrors,
+    effects: error_frames.ToolErrors,
 ) -> HalvedErrors | None:
     """Return the errors from all sources with half the sigma of one."""
     fit = linear.fit
     position, orientation = (sum(getattr(each, name) for each in lines) for name in LENGTHS)
     parameters = sum(each.parameters for each in lines)
     if line.source.kind in OF_ROWS:
-        moves_frames = frame not in (FITTED, BASE, RELATIVE)
+        moves_frames = frame not in (error_frames.FITTED, error_frames.BASE, error_frames.RELATIVE)
         halved = _halve_sigma(linear, split, line.source, moves_frames=moves_frames)
         if halved is None:
             return None
@@ -709,10 +705,10 @@ def _halve(
             noise = fit.residual_test.sigma_scale**2
             frames = describe_frames(problem, linear.data, found, prior, linearization, noise)
             posterior = replace(fit.posterior, discrepancy=None, frames=frames)
-            effects = linearize_tool_errors(posterior, solution, frame)
+            effects = error_frames.linearize_tool_errors(posterior, solution, frame)
         D, own = effects.by_parameters / fit.posterior.unit, effects.by_frame
-        own = own[..., :0] if frame == RELATIVE else own
-        angle, place = compute_mean_squares(np.concatenate([D @ root, own], axis=2))
+        own = own[..., :0] if frame == error_frames.RELATIVE else own
+        angle, place = error_frames.compute_mean_squares(np.concatenate([D @ root, own], axis=2))
         kept = [each for each in lines if each.source.kind not in OF_ROWS]
         place += sum(each.position for each in kept)
         angle += sum(each.orientation for each in kept)

@@ -25,21 +25,10 @@ import numpy as np
 
 from loopcal.apply.calibration_options import check_limit
 from loopcal.apply.conformity import Conformity, judge_limits, report_conformity
+from loopcal.diagnose import row_errors
 from loopcal.diagnose.blunders import Blunder, Explanation, check_held_out_rows, name_blunders
 from loopcal.diagnose.conventions.convention_check import find_moved_setups
 from loopcal.diagnose.measured_points import report_base_targets
-from loopcal.diagnose.row_errors import (
-    KindErrors,
-    NoiseFloor,
-    PoseErrors,
-    PosePredictions,
-    PredictionComparison,
-    QuantityErrors,
-    compare_predictions,
-    compute_noise_floor,
-    compute_row_errors,
-    predict_poses,
-)
 from loopcal.errors import DataError, suggest_names
 from loopcal.estimate.fit_linearization import FitUncertainty, collect_uncertainty
 from loopcal.estimate.posterior import ModelDiscrepancy
@@ -149,12 +138,12 @@ class Validation(DrawnResult):
     """
 
     poses: tuple[str, ...]
-    before: PoseErrors
-    after: PoseErrors
-    commanded_before: PoseErrors
-    commanded_after: PoseErrors
-    not_compensable: PoseErrors
-    noise_floor: NoiseFloor
+    before: row_errors.PoseErrors
+    after: row_errors.PoseErrors
+    commanded_before: row_errors.PoseErrors
+    commanded_after: row_errors.PoseErrors
+    not_compensable: row_errors.PoseErrors
+    noise_floor: row_errors.NoiseFloor
     unreachable: tuple[str, ...]
     limit_position: float | None
     limit_angle: float | None
@@ -163,7 +152,7 @@ class Validation(DrawnResult):
     alignment: Mapping[str, tuple[str, ...]] = field(
         default_factory=lambda: {"kept": (), "fitted": ()}
     )
-    kinds: tuple[KindErrors, ...] = ()
+    kinds: tuple[row_errors.KindErrors, ...] = ()
     setup_count: int = 0
     absorbed: int = 0
     judged: int = 0
@@ -237,7 +226,7 @@ class Validation(DrawnResult):
             for quantity, errors in self.after.quantities.items()
         }
 
-    def errors(self) -> dict[str, PoseErrors]:
+    def errors(self) -> dict[str, row_errors.PoseErrors]:
         """Return the errors by name."""
         return {
             "predicted before": self.before,
@@ -329,14 +318,16 @@ def validate(
         {name: value for name, value in values.items() if owner_of(name) not in refitted}
         for values in (nuisance_values_before, nuisance_values)
     )
-    compared = compare_predictions(old or robot.nominal, robot, data, kept_before, kept)
+    compared = row_errors.compare_predictions(old or robot.nominal, robot, data, kept_before, kept)
     is_open, unpredicted = _find_unpredicted(compared, uncertainty)
     if unpredicted:
         pairs = zip(compared.data.observations, is_open, strict=True)
         data = replace(compared.data, observations=tuple(o.take(~of_kind) for o, of_kind in pairs))
         if not data.n_rows and robot.redundancy is None:
             raise DataError(unpredicted[0])
-        compared = compare_predictions(old or robot.nominal, robot, data, kept_before, kept)
+        compared = row_errors.compare_predictions(
+            old or robot.nominal, robot, data, kept_before, kept
+        )
     limits = {"position": limit_position, "orientation": limit_angle}
     slow = None if uncertainty is None else uncertainty.posterior.discrepancy
     result = _summarize(robot, compared, limits, noise, slow)
@@ -381,7 +372,7 @@ def validate(
 
 def _summarize(
     robot: Mechanism,
-    compared: PredictionComparison,
+    compared: row_errors.PredictionComparison,
     limits: Mapping[str, float | None],
     noise: NoiseKnowledge,
     slow: ModelDiscrepancy | None,
@@ -391,7 +382,7 @@ def _summarize(
     before, after = compared.before.residuals(rows), compared.after.residuals(rows)
     missed = compared.before.differences(rows, compared.reached)
     reached = [m - r for m, r in zip(missed, after, strict=True)]
-    errors = compute_row_errors(rows, after)
+    errors = row_errors.compute_row_errors(rows, after)
     kinds = compared.kind_errors()
     if slow is not None:
         numbers = (compared.measure_slow_gain(slow.errors), float(slow.degrees.min()))
@@ -399,12 +390,12 @@ def _summarize(
         kinds = (*kinds[:-1], every)
     return Validation(
         poses=compared.rows,
-        before=compute_row_errors(rows, before),
+        before=row_errors.compute_row_errors(rows, before),
         after=errors,
-        commanded_before=compute_row_errors(rows, [-r for r in before]),
-        commanded_after=compute_row_errors(rows, reached),
-        not_compensable=compute_row_errors(rows, missed),
-        noise_floor=compute_noise_floor(rows),
+        commanded_before=row_errors.compute_row_errors(rows, [-r for r in before]),
+        commanded_after=row_errors.compute_row_errors(rows, reached),
+        not_compensable=row_errors.compute_row_errors(rows, missed),
+        noise_floor=row_errors.compute_noise_floor(rows),
         unreachable=(),
         limit_position=limits["position"],
         limit_angle=limits["orientation"],
@@ -418,7 +409,7 @@ def _summarize(
     )
 
 
-def find_error_units(robot: Mechanism, errors: PoseErrors) -> dict[str, Unit]:
+def find_error_units(robot: Mechanism, errors: row_errors.PoseErrors) -> dict[str, Unit]:
     """Return the unit of each quantity of errors, that in which a robot shows its dimension."""
     return {name: robot.get_unit(e.dimension) for name, e in errors.quantities.items()}
 
@@ -434,7 +425,7 @@ def owner_of(name: str) -> str:
     return name if axis in SCALES else owner
 
 
-def group_setup(prediction: PosePredictions) -> dict[str, tuple[str, ...]]:
+def group_setup(prediction: row_errors.PosePredictions) -> dict[str, tuple[str, ...]]:
     """Return the frames, targets and surfaces that are kept, and those fitted to the rows."""
     groups: dict[str, dict[str, None]] = {"kept": {}, "fitted": {}}
     for name in prediction.setup.table.names:
@@ -442,7 +433,7 @@ def group_setup(prediction: PosePredictions) -> dict[str, tuple[str, ...]]:
     return {key: tuple(owners) for key, owners in groups.items()}
 
 
-def describe_frame(errors: PoseErrors, setup: Sequence[str]) -> str:
+def describe_frame(errors: row_errors.PoseErrors, setup: Sequence[str]) -> str:
     """Return the frame of errors in words; without any `setup` that was estimated, positions and
     orientations are those in the stated frame of the instrument.
     """
@@ -453,7 +444,9 @@ def describe_frame(errors: PoseErrors, setup: Sequence[str]) -> str:
     return "without any frame"
 
 
-def _report_setup(first: PosePredictions, last: PosePredictions) -> list[Finding]:
+def _report_setup(
+    first: row_errors.PosePredictions, last: row_errors.PosePredictions
+) -> list[Finding]:
     """Report where the setup parameters come from."""
     before, after = group_setup(first), group_setup(last)
     codes = {
@@ -467,7 +460,7 @@ def _report_setup(first: PosePredictions, last: PosePredictions) -> list[Finding
 
 
 def _report_moved_setup(
-    robot: Mechanism, compared: PredictionComparison, kept: Mapping[str, float]
+    robot: Mechanism, compared: row_errors.PredictionComparison, kept: Mapping[str, float]
 ) -> list[Finding]:
     """Report kept frames, targets and surfaces that were apparently moved after the fit."""
     data, rows = compared.data, compared.data.observations
@@ -479,7 +472,9 @@ def _report_moved_setup(
         moved = frozenset(refit)
         values = {name: v for name, v in kept.items() if owner.get(name) not in moved}
         try:
-            prediction = predict_poses(robot, data, compared.solution, compared.usable, values)
+            prediction = row_errors.predict_poses(
+                robot, data, compared.solution, compared.usable, values
+            )
         except DataError:  # too few rows to fit it
             return float("nan"), 0
         total = 0.0
@@ -500,7 +495,9 @@ def _report_moved_setup(
 # Poses and quantities of which little or nothing is compared.
 
 
-def _report_left_out(data: Measurements, compared: PredictionComparison) -> list[Finding]:
+def _report_left_out(
+    data: Measurements, compared: row_errors.PredictionComparison
+) -> list[Finding]:
     """Report poses with rows that no statistic contains, and poses that were estimated."""
     has_rows = np.zeros(data.n_poses, dtype=bool)
     for o in data.observations:
@@ -526,7 +523,7 @@ def _report_left_out(data: Measurements, compared: PredictionComparison) -> list
 
 
 def _find_unpredicted(
-    compared: PredictionComparison, uncertainty: FitUncertainty | None
+    compared: row_errors.PredictionComparison, uncertainty: FitUncertainty | None
 ) -> tuple[list[BoolArray], list[Finding]]:
     """Return the rows (r,) of every kind whose setup the fit does not know: at a known machine it
     moves their prediction by more than `SETUP_KNOWN` standard deviations of the noise; and the
@@ -673,7 +670,7 @@ def restore_validation(
         content,
         **errors,
         units=find_error_units(robot, errors["after"]),
-        noise_floor=restore(NoiseFloor, {"metrics": content["noise_floor"]}),
+        noise_floor=restore(row_errors.NoiseFloor, {"metrics": content["noise_floor"]}),
         findings=(),
         blunders=tuple(
             restore(Blunder, blunder, explanation=Explanation("none"))
@@ -685,7 +682,7 @@ def restore_validation(
 
 def _restore_errors(
     content: Mapping[str, Any], arrays: Mapping[str, np.ndarray], name: str
-) -> PoseErrors:
+) -> row_errors.PoseErrors:
     quantities = {}
     for quantity, stored in content.items():
         components = arrays.get(f"{name}_{quantity}")
@@ -694,6 +691,6 @@ def _restore_errors(
             components = np.column_stack([size, np.full((len(size), 2), np.nan)])
         measured = tuple(stored["components"])
         quantities[quantity] = restore(
-            QuantityErrors, stored, components=components, measured=measured
+            row_errors.QuantityErrors, stored, components=components, measured=measured
         )
-    return PoseErrors(quantities)
+    return row_errors.PoseErrors(quantities)

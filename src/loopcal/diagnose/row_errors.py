@@ -22,12 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from loopcal.errors import DataError
-from loopcal.estimate.pose_estimate import (
-    PoseFit,
-    fit_nuisance_values,
-    fit_poses,
-    predict_from_readings,
-)
+from loopcal.estimate import pose_estimate
 from loopcal.estimate.posterior import combine_degrees
 from loopcal.estimate.result import SMALLEST_EFFECT
 from loopcal.estimate.smooth_errors import SmoothErrors
@@ -470,7 +465,7 @@ class PredictionComparison:
     # poses that the geometry after reaches when it is commanded to those of `before`
     reached: PosePredictions
     # of the two geometries, the fits of redundant readings alone; None where there are none
-    reading_fits: tuple[PoseFit | None, PoseFit | None]
+    reading_fits: tuple[pose_estimate.PoseFit | None, pose_estimate.PoseFit | None]
 
     def count_judged(self) -> int:
         """Return the number of poses that rows or redundant readings check."""
@@ -597,19 +592,19 @@ class _LocatedPoses(NamedTuple):
     is_determined: BoolArray
     estimated: BoolArray
     absorbed: IntArray
-    readings: PoseFit | None
+    readings: pose_estimate.PoseFit | None
 
 
 def _locate_poses(
     robot: Mechanism, data: Measurements, setup: Mapping[str, float]
 ) -> _LocatedPoses:
     """Return the poses of a geometry, with setup parameters that are kept."""
-    solution, known = predict_from_readings(robot, data)
-    readings = None if robot.redundancy is None else fit_poses(robot, data)
+    solution, known = pose_estimate.predict_from_readings(robot, data)
+    readings = None if robot.redundancy is None else pose_estimate.fit_poses(robot, data)
     nothing = np.zeros(data.n_poses, dtype=np.int64)
     if known.all() or not data.n_rows:
         return _LocatedPoses(solution, known, np.zeros_like(known), nothing, readings)
-    fitted = fit_poses(robot, data, _fix_nuisance(data.nuisance_parameters, setup))
+    fitted = pose_estimate.fit_poses(robot, data, _fix_nuisance(data.nuisance_parameters, setup))
     reached = fitted.solution.converged
     estimated = ~known & fitted.is_determined & reached & (fitted.left > 0)
 
@@ -662,7 +657,9 @@ def predict_poses(
         if len(kept) == len(unknowns):
             values = np.array([setup[name] for name in unknowns.table.names])
         else:
-            values = fit_nuisance_values(robot, data, T, _fix_nuisance(unknowns, setup), joints)
+            values = pose_estimate.fit_nuisance_values(
+                robot, data, T, _fix_nuisance(unknowns, setup), joints
+            )
     return PosePredictions(T[None], joints, unknowns, values[None], kept)
 
 

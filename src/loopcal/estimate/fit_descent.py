@@ -42,12 +42,8 @@ from loopcal.findings import Finding, report_finding
 from loopcal.measure.kinds.kind import Evaluation
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.nuisance import NuisanceParameters
+from loopcal.numerics import statistics
 from loopcal.numerics.gauss_newton import DescentStatus
-from loopcal.numerics.statistics import (
-    compute_chi_square_quantile,
-    compute_chi_square_tail,
-    compute_median,
-)
 from loopcal.parameters import ParameterTable
 from loopcal.typing import FloatArray, IntArray, Progress, report_no_progress
 
@@ -448,8 +444,10 @@ def estimate_scale_of(distance: FloatArray, degrees: FloatArray) -> float:
     It is the median of d over the median of the chi distribution with the block's degrees.
     """
     is_tested = degrees > 0.0
-    ratio = distance[is_tested] / np.sqrt(compute_chi_square_quantile(degrees[is_tested], 0.5))
-    middle = compute_median(ratio) if len(ratio) else 1.0
+    ratio = distance[is_tested] / np.sqrt(
+        statistics.compute_chi_square_quantile(degrees[is_tested], 0.5)
+    )
+    middle = statistics.compute_median(ratio) if len(ratio) else 1.0
     return middle if middle > 0.0 else 1.0
 
 
@@ -472,7 +470,7 @@ def add_loss_uncertainty(
     unit = estimate_scale_of(distance, counts) if test.noise == "estimated" else 1.0
     variance, left = compute_loss_variance(loss, distance, counts, result.rank, unit)
     times = variance / test.sigma_scale**2
-    if left < 1.0 or compute_chi_square_tail(left, left * times) >= SIGNIFICANCE:
+    if left < 1.0 or statistics.compute_chi_square_tail(left, left * times) >= SIGNIFICANCE:
         return result
     roots = [part.root for part in result.posterior.parts if part.source == NOISE]
     root = np.sqrt(times - 1.0) * np.concatenate(roots, axis=1)

@@ -18,16 +18,12 @@ from typing import Any, ClassVar, NoReturn
 import numpy as np
 
 from loopcal.errors import DataError, EstimationError, suggest_names
+from loopcal.estimate import information
 from loopcal.estimate.descent import Descent, LinearModel, descend
 from loopcal.estimate.determinable_setup import fix_undetermined_setup
 from loopcal.estimate.fit_analysis import ASSUMED, FitAnalysis
 from loopcal.estimate.fit_descent import fit_rows, fit_with_tolerances, get_method, repeat_trials
 from loopcal.estimate.free_parameters import FreeParameters, select_free_parameters
-from loopcal.estimate.information import (
-    describe_frames,
-    find_unfixed_motions,
-    has_equations_to_spare,
-)
 from loopcal.estimate.linearization import PoseSolution, Start, linearize_rows
 from loopcal.estimate.losses import Loss
 from loopcal.estimate.options import FitOptions, merge_options
@@ -116,7 +112,7 @@ def check_count(problem: Problem, data: Measurements, options: FitOptions, z: Fl
         return
     if m == 0:
         raise EstimationError.of("fit.no-equation-left", poses=data.n_poses, unknowns=p)
-    if has_equations_to_spare(problem, z, method, options.rank_tolerance):
+    if information.has_equations_to_spare(problem, z, method, options.rank_tolerance):
         return
     raise EstimationError.of(
         "fit.too-few-equations",
@@ -493,8 +489,8 @@ def compute_trial_posterior(fits: IdentifiedTrials, trials: Trials, trial: int) 
     z = free.deviation(fits.values[chosen])
     start = problem.start(z)
     linearization = problem.linearize(z, start)
-    found = find_unfixed_motions(problem, z, linearization.next_start)
-    frames = describe_frames(problem, data, found, linearization=linearization)
+    found = information.find_unfixed_motions(problem, z, linearization.next_start)
+    frames = information.describe_frames(problem, data, found, linearization=linearization)
     prior = fits.prior_variance
     return compute_posterior(
         free.robot.with_values(fits.values[trial]),

@@ -27,15 +27,9 @@ from typing import ClassVar, Literal, Protocol
 import numpy as np
 
 from loopcal.errors import EstimationError
+from loopcal.estimate import tolerance_components
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.residual_test import FEWEST_DEGREES
-from loopcal.estimate.tolerance_components import (
-    By,
-    InflatedTolerances,
-    ToleranceComponent,
-    compute_prior_covariance,
-    compute_symmetric_root,
-)
 from loopcal.findings import Finding, report_finding
 from loopcal.numerics.decomposition import RANK_TOLERANCE, Decomposition, decompose
 from loopcal.parameters import match_names
@@ -443,7 +437,7 @@ class MAP(Method):
     held: bool = False
     noise: Literal["given", "estimated"] = "given"
     correlation: FloatArray | None = field(default=None, repr=False, compare=False)
-    components: tuple[ToleranceComponent, ...] = ()
+    components: tuple[tolerance_components.ToleranceComponent, ...] = ()
 
     def __post_init__(self) -> None:
         if not callable(self.inflation) and not 0.0 < self.inflation < np.inf:
@@ -466,7 +460,7 @@ class MAP(Method):
         """
         if not self.held:
             return self.correlation
-        covariance = compute_prior_covariance(parameters, self.correlation, ())
+        covariance = tolerance_components.compute_prior_covariance(parameters, self.correlation, ())
         return covariance + np.diag(np.where(self.free, HOLD**2 - 1.0, 0.0))
 
     def root(self, parameters: int) -> FloatArray | None:
@@ -474,8 +468,10 @@ class MAP(Method):
         covariance = self.covariance(parameters)
         if covariance is None and not self.components:
             return None
-        covariance = compute_prior_covariance(parameters, covariance, self.components)
-        return compute_symmetric_root(covariance)
+        covariance = tolerance_components.compute_prior_covariance(
+            parameters, covariance, self.components
+        )
+        return tolerance_components.compute_symmetric_root(covariance)
 
     def find_weak(
         self, decomposition: Decomposition, limit: FloatArray | float = WEAKEST
@@ -571,11 +567,13 @@ def decompose_for(
     return d.separated(np.array(method.free)) if isinstance(method, MAP) and method.held else d
 
 
-def make_default_method(inflation: By | Literal["none"] = "auto") -> Method | None:
+def make_default_method(
+    inflation: tolerance_components.By | Literal["none"] = "auto",
+) -> Method | None:
     """Return the default method, None, or MAP with another choice of what may be inflated."""
     if inflation == "auto":
         return None
-    return MAP() if inflation == "none" else MAP(InflatedTolerances(inflation))
+    return MAP() if inflation == "none" else MAP(tolerance_components.InflatedTolerances(inflation))
 
 
 def adapt_method(
@@ -589,7 +587,7 @@ def adapt_method(
     names (p,); MAP with what it must know, which tolerances (p,) are assumed and the correlation
     (p, p) of the deviations by common errors.
     """
-    method = MAP(InflatedTolerances()) if method is None else method
+    method = MAP(tolerance_components.InflatedTolerances()) if method is None else method
     if isinstance(method, Ridge):
         return method.resolve(names)
     if not isinstance(method, MAP):

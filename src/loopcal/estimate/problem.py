@@ -31,12 +31,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from loopcal import engine
-from loopcal.estimate.elimination import (
-    NodeRows,
-    NuisanceElimination,
-    fold_node_rows,
-    plan_elimination,
-)
+from loopcal.estimate import elimination
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.linearization import (
     LeverageRows,
@@ -84,7 +79,10 @@ AtNodes = Callable[[IntArray], tuple[IntArray, FloatArray, FloatArray]]
 
 
 def spread_rows(
-    poses: PoseRows, block: PoseBlock, node_rows: Iterable[NodeRows], at_nodes: AtNodes | None
+    poses: PoseRows,
+    block: PoseBlock,
+    node_rows: Iterable[elimination.NodeRows],
+    at_nodes: AtNodes | None,
 ) -> Iterator[LeverageRows]:
     """Give rows with columns for the nuisance parameters that they move, poses eliminated (one
     trial).
@@ -216,7 +214,7 @@ class Problem:
         return self.poses.rows
 
     @property
-    def nuisance(self) -> NuisanceElimination | None:
+    def nuisance(self) -> elimination.NuisanceElimination | None:
         """The nuisance parameters and their elimination tree; None without any."""
         return self.poses.nuisance
 
@@ -489,7 +487,7 @@ class Problem:
             factor, is_lost = poses.fold_plain_rows(factor, solution, z, trials)
         else:
             for _, node_rows, lost in poses.iterate_rows(solution, z, trials):
-                factor = fold_node_rows(factor, factors, node_rows)
+                factor = elimination.fold_node_rows(factor, factors, node_rows)
                 is_lost |= lost
                 del node_rows  # else the last ones stay in memory
         equations = self.residual_count
@@ -623,7 +621,7 @@ def make_problem(
         problem = make_exact_problem(free, recorded[:1], rows, trials, local, data)
         return replace(problem, consistent=consistent)
     poses = _make_uncertain_rows(free, recorded, believed, rows)
-    poses = replace(poses, nuisance=plan_elimination(local, rows, poses.member))
+    poses = replace(poses, nuisance=elimination.plan_elimination(local, rows, poses.member))
     numbers = np.arange(trials)
     return Problem(poses, recorded, numbers, data, POSE_CONTROL, believed, consistent)
 
@@ -641,7 +639,7 @@ def make_exact_problem(
     """
     coordinates = PoseCoordinates(free, list_sensed_joints(r.kind for r in rows), readings)
     member = np.zeros(readings.shape[1], dtype=np.int64)
-    poses = PoseRows(free, rows, plan_elimination(local, rows), coordinates, member)
+    poses = PoseRows(free, rows, elimination.plan_elimination(local, rows), coordinates, member)
     return Problem(poses, readings, np.arange(trials), data)
 
 

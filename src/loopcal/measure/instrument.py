@@ -13,13 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from loopcal.errors import DataError
-from loopcal.measure.array_checks import (
-    check_array,
-    check_seed,
-    check_type,
-    refuse_first,
-    set_fields,
-)
+from loopcal.measure import array_checks
 from loopcal.measure.kinds.kind import Kind, measure_progress
 from loopcal.measure.nuisance import StatedValue
 from loopcal.measure.observations import TextArray, check_labels, check_poses, check_rows
@@ -51,8 +45,8 @@ class Noise(ABC):
 
 
 def _check_positive(value: ArrayLike, what: str) -> FloatArray:
-    array = check_array(value, what, (None,))
-    refuse_first(
+    array = array_checks.check_array(value, what, (None,))
+    array_checks.refuse_first(
         ~is_sd(array),
         lambda i: (
             f"{what} contains {array[i]:.6g}. Give a number above 0 for each column, {SD_RANGE}"
@@ -74,10 +68,10 @@ class Gaussian(Noise):
 
     def __post_init__(self) -> None:
         what = "the sigma of the noise"
-        sd = check_array(self.sd, what, (None,))
+        sd = array_checks.check_array(self.sd, what, (None,))
         stated = [*self.sight.values(), *sd[sd != 0.0]] if self.sight else sd
         _check_positive(stated, what)
-        set_fields(self, sd=sd)
+        array_checks.set_fields(self, sd=sd)
 
     __repr__ = represent
 
@@ -98,7 +92,7 @@ class Uniform(Noise):
     limit: FloatArray
 
     def __post_init__(self) -> None:
-        set_fields(self, limit=_check_positive(self.limit, "the limits of the noise"))
+        array_checks.set_fields(self, limit=_check_positive(self.limit, "the limits of the noise"))
 
     __repr__ = represent
 
@@ -139,7 +133,7 @@ def make_random_stream(seed: Seed, trial: int, purpose: int = 0) -> np.random.Ge
     if isinstance(seed, BlockStream):
         counter = np.array([0, purpose, trial, seed.block], dtype=np.uint64)
         return np.random.Generator(np.random.Philox(key=seed.key, counter=counter))
-    check_seed(seed)
+    array_checks.check_seed(seed)
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(trial, purpose)))
 
 
@@ -167,8 +161,8 @@ class Sensor:
     group: TextArray = field(default_factory=lambda: np.array(""))
 
     def __post_init__(self) -> None:
-        check_type(self.kind, Kind, "kind", "such as loopcal.Pose()")
-        check_type(self.noise, Noise, "noise", "such as loopcal.Gaussian([...])")
+        array_checks.check_type(self.kind, Kind, "kind", "such as loopcal.Pose()")
+        array_checks.check_type(self.noise, Noise, "noise", "such as loopcal.Gaussian([...])")
         if len(self.noise.sigma) != len(self.kind.noise_columns):
             names = ", ".join(column.name for column in self.kind.noise_columns)
             raise DataError(
@@ -233,11 +227,15 @@ class Instrument:
     has_stations: bool = False
 
     def __post_init__(self) -> None:
-        set_fields(self, sensors=tuple(self.sensors), stated_values=tuple(self.stated_values))
+        array_checks.set_fields(
+            self, sensors=tuple(self.sensors), stated_values=tuple(self.stated_values)
+        )
         if not self.sensors:
             raise DataError("an instrument needs at least one sensor: a kind and its noise")
         for sensor in self.sensors:
-            check_type(sensor, Sensor, "sensors", "such as loopcal.Sensor(kind, noise)")
+            array_checks.check_type(
+                sensor, Sensor, "sensors", "such as loopcal.Sensor(kind, noise)"
+            )
 
     def __repr__(self) -> str:
         sensors = "".join(f"  {sensor!r},\n" for sensor in self.sensors[:8])

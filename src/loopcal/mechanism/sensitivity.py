@@ -19,15 +19,7 @@ import numpy as np
 
 from loopcal import engine, geometry
 from loopcal.engine import State
-from loopcal.mechanism.actuation import (
-    Derivatives,
-    DrivenJoints,
-    differentiate_driven_joints,
-    differentiate_open_sums,
-    differentiate_unknowns_by_sums,
-    drive_joints,
-    spread_twists,
-)
+from loopcal.mechanism import actuation
 from loopcal.mechanism.chains import each_stage, locate_bodies, transport_to_end
 from loopcal.mechanism.least_squares_closure import (
     differentiate_unknowns,
@@ -47,7 +39,7 @@ def differentiate_pose(
     state: State,
     columns: ParameterUnits | None = None,
     nodes: int = 1,
-) -> Derivatives:
+) -> actuation.Derivatives:
     """Differentiate the pose by the implicit function theorem, D = -A^-1 [E de/dp + Q dq/dp].
 
     Return the twists (omega in base axes, velocity of the platform's origin) per unit of each
@@ -60,29 +52,29 @@ def differentiate_pose(
     chosen = columns or robot.all_parameters
     p = len(chosen.places)
     if robot.has_open_sums:
-        moved = chosen.select(differentiate_open_sums(robot, values, q, state))
-        derivatives = np.split(spread_twists(robot.program, moved, nodes), [p], axis=3)
+        moved = chosen.select(actuation.differentiate_open_sums(robot, values, q, state))
+        derivatives = np.split(actuation.spread_twists(robot.program, moved, nodes), [p], axis=3)
     else:
-        e, drives, joints = drive_joints(robot, values, q)
+        e, drives, joints = actuation.drive_joints(robot, values, q)
         with np.errstate(invalid="ignore"):  # as in `drive_joints`
             inputs = chosen.linearize(values, drives, q)
             given = robot.program, e, joints, state, inputs, nodes
             by_parameters, turned = engine.differentiate(*given)
             if robot.has_sums:
-                by_inputs = differentiate_driven_joints(robot, values, q)
+                by_inputs = actuation.differentiate_driven_joints(robot, values, q)
                 turned = np.matmul(turned, by_inputs[..., len(robot.parameters) :])
         derivatives = [by_parameters, turned]
     is_open = find_open_loops(robot, state)
     if is_open.any():
         moved = differentiate_unknowns(robot, values, q, state, chosen)
-        parts = np.split(spread_twists(robot.program, moved, nodes), [p], axis=3)
+        parts = np.split(actuation.spread_twists(robot.program, moved, nodes), [p], axis=3)
         for derivative, own in zip(derivatives, parts, strict=True):
             derivative[is_open] = own[is_open]
     lost = ~is_closed(state.status)
     if lost.any():
         for derivative in derivatives:
             derivative[lost] = np.nan
-    return Derivatives(*derivatives)
+    return actuation.Derivatives(*derivatives)
 
 
 def differentiate_platform(
@@ -92,7 +84,7 @@ def differentiate_platform(
     state: State,
     columns: ParameterUnits | None = None,
     end: int = -1,
-) -> Derivatives:
+) -> actuation.Derivatives:
     """Differentiate the platform of a stage of a chain (default: the end) as `differentiate_pose`
     does that of a robot, by the twists of the stages that carry it.
     """
@@ -112,10 +104,10 @@ def differentiate_platform(
     return whole
 
 
-def _make_zeros(robot: Mechanism, state: State, rows: int, columns: int) -> Derivatives:
+def _make_zeros(robot: Mechanism, state: State, rows: int, columns: int) -> actuation.Derivatives:
     """Return derivatives (t, n, rows, ..) of zero by `columns` parameters and all readings."""
     t, n = state.T.shape[:2]
-    return Derivatives(
+    return actuation.Derivatives(
         np.zeros((t, n, rows, columns)), np.zeros((t, n, rows, len(robot.actuators)))
     )
 
@@ -128,7 +120,9 @@ def differentiate_by_drives(
     """
     if weights is None:
         return engine.differentiate(robot.program, e, u, state, robot.program.drive_map)[1]
-    return spread_twists(robot.program, differentiate_unknowns_by_sums(robot, e, state, weights))
+    return actuation.spread_twists(
+        robot.program, actuation.differentiate_unknowns_by_sums(robot, e, state, weights)
+    )
 
 
 def fold_pose_rows(
@@ -139,13 +133,13 @@ def fold_pose_rows(
     columns: ParameterUnits,
     observed: Sequence[engine.TwistRows],
     factor: FloatArray,
-    driven: DrivenJoints | None = None,
+    driven: actuation.DrivenJoints | None = None,
 ) -> tuple[FloatArray, BoolArray]:
     """Fold rows [G D | r] of observed poses into factors (t, p + 1, p + 1), with D of
     `differentiate_pose`; see `engine.fold_poses`. For robots without stages whose readings
     determine the joints, and whose loops close.
     """
-    e, drives, joints = driven or drive_joints(robot, values, q)
+    e, drives, joints = driven or actuation.drive_joints(robot, values, q)
     inputs = columns.linearize(values, drives, q)
     return engine.fold_poses(factor, robot.program, e, joints, state, inputs, observed)
 
@@ -175,13 +169,13 @@ def differentiate_passive_joints(
         return PassiveSensitivity(names, *whole)
     program, p = robot.program, len(robot.parameters)
     if robot.has_open_sums:
-        moved = differentiate_open_sums(robot, values, q, state)
+        moved = actuation.differentiate_open_sums(robot, values, q, state)
         twists, driven = np.split(moved, [len(program.unknown_twists)], axis=2)
     else:
         nodes = differentiate_pose(robot, values, q, state, nodes=len(program.nodes))
         freedoms = [6 * node + f for node, f in program.unknown_twists]
         twists = np.concatenate(nodes, axis=3)[:, :, freedoms]
-        driven = differentiate_driven_joints(robot, values, q)
+        driven = actuation.differentiate_driven_joints(robot, values, q)
     by_inputs = move_passive_joints(robot, values, state, twists, driven)
     is_open = find_open_loops(robot, state)
     if is_open.any():
@@ -196,7 +190,7 @@ def differentiate_passive_joints(
 
 def differentiate_bodies(
     robot: Mechanism, values: FloatArray, q: FloatArray, state: State, names: Sequence[str]
-) -> dict[str, Derivatives]:
+) -> dict[str, actuation.Derivatives]:
     """Differentiate bodies of `locate_bodies` as `differentiate_pose` the platform, by name."""
     if robot.stages:
         ends = [stage.name for stage in robot.stages]
@@ -206,12 +200,12 @@ def differentiate_bodies(
     bodies = list(robot.assembly.bodies) if names else []
     whole = differentiate_pose(robot, values, q, state, nodes=1 + len(bodies))
     rows = {name: slice(6 * i, 6 * i + 6) for i, name in enumerate(bodies, 1)}
-    return {name: Derivatives(*(by[:, :, rows[name]] for by in whole)) for name in names}
+    return {name: actuation.Derivatives(*(by[:, :, rows[name]] for by in whole)) for name in names}
 
 
 def differentiate_sensed_values(
     robot: Mechanism, values: FloatArray, q: FloatArray, state: State, names: Sequence[str]
-) -> Derivatives:
+) -> actuation.Derivatives:
     """Differentiate passive joints and the numbers of bodies, by name."""
     known: list[str] = []
     derivatives: list[tuple[FloatArray, FloatArray]] = []
@@ -228,4 +222,4 @@ def differentiate_sensed_values(
         derivatives.append((joints.parameters, joints.readings))
     places = [known.index(name) for name in names]
     arrays = zip(*derivatives, strict=True)
-    return Derivatives(*(np.concatenate(of, axis=2)[:, :, places] for of in arrays))
+    return actuation.Derivatives(*(np.concatenate(of, axis=2)[:, :, places] for of in arrays))

@@ -641,8 +641,6 @@ def without_rounding(values: FloatArray, size: FloatArray) -> FloatArray:
 
 def has_rounding(values: FloatArray, size: float) -> bool:
     """Return whether any of derivatives may be rounding of terms that are at most this large."""
-    if not isinstance(values, np.ndarray):  # jax in tests
-        return True
     limit = ROUNDING * size
     larger = np.count_nonzero(values > limit) + np.count_nonzero(values < -limit)
     return bool(larger < np.count_nonzero(values != 0.0))

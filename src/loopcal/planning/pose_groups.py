@@ -63,10 +63,6 @@ class GroupRows:
     # number of stations: all groups from the first one, then from the second ..
     n_stations: int = 1
 
-    def find_stations(self, groups: IntArray) -> IntArray:
-        """Return the stations (n,) of groups (n,)."""
-        return np.asarray(groups // (len(self.rows) // self.n_stations), dtype=np.intp)
-
     def fold(self) -> tuple[FloatArray, int]:
         """Return the factor (1, p + 1, p + 1) of all that could be measured, without spreads of
         the machine and the nuisance parameters eliminated, and the number of its rows.

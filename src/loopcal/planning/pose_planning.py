@@ -437,7 +437,7 @@ def _arrange_poses(
     """
     robot, members, candidates = problem.robot, problem.groups.members, problem.candidates
     groups, count = np.concatenate([chosen, held_out]), problem.groups.n_stations
-    selected, station_of = members[groups], problem.groups.find_stations(groups)
+    selected, station_of = members[groups], groups // (len(problem.groups.rows) // count)
     place = np.empty((count, len(candidates)), dtype=np.int64)
     ordered, stations, visits = place[0, :0], place[0, :0], []
     for station in np.unique(station_of):  # one after the other

@@ -16,19 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from loopcal.engine.numpy_engine.closure import (
-    Chain,
-    PlacedLinks,
-    add_terms,
-    divide_rows,
-    dot,
-    exponential,
-    list_coordinates,
-    matmul,
-    place_links,
-    split_bodies,
-    split_joints,
-)
+from loopcal.engine.numpy_engine import closure
 from loopcal.engine.numpy_engine.householder import back_substitute, count_reflections
 from loopcal.engine.numpy_engine.nodes import (
     Front,
@@ -78,10 +66,10 @@ def close_limbs(program: Program, e: FloatArray, q: FloatArray, start: State) ->
     joints = []
     with np.errstate(all="ignore"):
         for group, values in zip(program.groups, start.joints, strict=True):
-            links, shape = place_links(group, e), (t, n, *values.shape[2:])
+            links, shape = closure.place_links(group, e), (t, n, *values.shape[2:])
             filled = group.insert_driven(np.broadcast_to(values, shape), q)
             flat = filled.reshape(t * n, *shape[2:])  # a copy where the start is broadcast
-            for part in divide_rows(t * n):
+            for part in closure.divide_rows(t * n):
                 platform = T[part, :3].transpose(1, 2, 0).copy()
                 theta = flat[part].transpose(2, 1, 0).copy()
                 placed = links.select(np.arange(t * n)[part] // n)
@@ -104,7 +92,7 @@ def close_limbs(program: Program, e: FloatArray, q: FloatArray, start: State) ->
 
 
 def _close_group(
-    group: Group, links: PlacedLinks, T: FloatArray, theta: FloatArray, size: float
+    group: Group, links: closure.PlacedLinks, T: FloatArray, theta: FloatArray, size: float
 ) -> tuple[FloatArray, FloatArray]:
     """Set the unknown joint in theta (J + 1, k, N); return residuals and signs of slopes (k, N).
 
@@ -112,17 +100,17 @@ def _close_group(
     a'g - d = +- sqrt((a'g)^2 - |g|^2 + reach^2), whose sign is that of a'g.
     """
     (j,) = group.unknown_joints(free=True)
-    chain = Chain(group, links, T[None], theta, size)
+    chain = closure.Chain(group, links, T[None], theta, size)
     if j == len(group.joints):
         theta[j] = chain.distance - links.length
         return chain.distance - (links.length + theta[j]), np.full(theta[j].shape, -1.0)
     axis, gap, reach = chain.axes[j], chain.gap, links.length + theta[-1]
-    along = dot(axis, gap)
-    square = along**2 - dot(gap, gap) + reach**2
+    along = closure.dot(axis, gap)
+    square = along**2 - closure.dot(gap, gap) + reach**2
     left = np.copysign(np.sqrt(np.maximum(square, 0.0)), along)
     theta[j] += along - left
     gap = gap - (along - left) * axis
-    return np.sqrt(dot(gap, gap)) - reach, -np.sign(left)
+    return np.sqrt(closure.dot(gap, gap)) - reach, -np.sign(left)
 
 
 RESIDUAL, STEP = 1e-13, 1e-7
@@ -195,16 +183,16 @@ def solve(
         t, n = max(t, *map(len, sums)), max(n, sums.values.shape[1])
         whole = np.broadcast_to(sums.values, (t, n, sums.values.shape[2]))
         sums = Sums(sums.weights, whole.reshape(t * n, -1))
-    links = [place_links(g, e) for g in program.groups]
+    links = [closure.place_links(g, e) for g in program.groups]
     unknown = [g.unknown_joints(free) for g in program.groups]
     redundant = program.sigma is not None and not free
-    begin = list_coordinates(program, q, start, (t, n))
+    begin = closure.list_coordinates(program, q, start, (t, n))
     is_plain = task is None and sums is None and not (free or redundant)
     has_rods = is_plain and not any(g.joints for g in program.groups)
     together = has_rods and len(e) == 1 and start.T.shape[:2] == (1, 1)
     goals = None if goal is None else goal.T.reshape(t * n, 4, 4)[:, :3].transpose(1, 2, 0)
     chunks = []
-    for part in divide_rows(t * n) or [slice(0)]:
+    for part in closure.divide_rows(t * n) or [slice(0)]:
         rows = np.arange(t * n)[part]
         placed = [p.select(rows // n) for p in links]
         own = None
@@ -334,7 +322,7 @@ class _Equations:
     program: Program
     unknown: list[list[int]]
     redundant: bool
-    links: list[PlacedLinks]
+    links: list[closure.PlacedLinks]
     task: Task | None
     rows: np.ndarray
     sums: Sums | None = None
@@ -354,7 +342,7 @@ class _Equations:
         for group, theta in zip(self.program.groups, limbs, strict=True):
             for j in group.driven_joints:
                 q[group.actuator[j]] = theta[j]
-        return add_terms(self.sums.weights.T * q[:, None]) - self.sums.values.T
+        return closure.add_terms(self.sums.weights.T * q[:, None]) - self.sums.values.T
 
     def evaluate(self, coordinates: FloatArray, together: bool = False) -> Iterate:
         """Return the Newton step at these coordinates and its measures.
@@ -362,7 +350,10 @@ class _Equations:
         together : all rows have the Jacobian of the first one.
         """
         program, N = self.program, coordinates.shape[1]
-        bodies, limbs = split_bodies(program, coordinates), split_joints(program, coordinates)
+        bodies, limbs = (
+            closure.split_bodies(program, coordinates),
+            closure.split_joints(program, coordinates),
+        )
         sides, bodies = (N, bodies[..., :1]) if together else (1, bodies)
         eliminated = [self._eliminate(i, bodies, theta) for i, theta in enumerate(limbs)]
         tops, lows, signs, pivots = map(list, zip(*eliminated, strict=True))
@@ -380,12 +371,12 @@ class _Equations:
         inner = np.zeros(N)
         for top in tops:
             if len(top):
-                inner += add_terms(add_terms(top[:, -1] ** 2))
+                inner += closure.add_terms(closure.add_terms(top[:, -1] ** 2))
         right = np.concatenate([front.rows[:, -sides:] for front in fronts])
-        norm = np.sqrt(inner + add_terms(right**2).reshape(N))
+        norm = np.sqrt(inner + closure.add_terms(right**2).reshape(N))
         factored, sign = factor_nodes(program, fronts, sides, self.sums is not None)
         removable = np.concatenate([front.rows[:, -sides:] for front in factored])
-        reducible = np.sqrt(inner + add_terms(removable**2).reshape(N))
+        reducible = np.sqrt(inner + closure.add_terms(removable**2).reshape(N))
         y = {node: part.reshape(-1, N) for node, part in solve_nodes(program, factored, sides)}
         sign, pivot = reduce(np.multiply, signs) * sign, reduce(np.minimum, pivots)
         twist = np.zeros((6 * len(program.nodes), N))
@@ -396,7 +387,7 @@ class _Equations:
             if u := len(top):
                 own = gather_unknowns(program, group, y)
                 columns = top[:, u : u + len(own)].swapaxes(0, 1)
-                rest = turns[i] + add_terms(np.multiply(columns, own[:, None], order="C"))
+                rest = turns[i] + closure.add_terms(np.multiply(columns, own[:, None], order="C"))
                 turns[i] = back_substitute(top[:, :u], -rest[:, None])[:, 0]
         driven = y.get(len(program.nodes), np.zeros((0, N)))
         step = np.concatenate([twist, *(turn.reshape(-1, N) for turn in turns), driven])
@@ -411,12 +402,12 @@ class _Equations:
         if self.redundant:
             return out
         equations, coordinates = self.select(of), coordinates.take(of, axis=1)
-        bodies, square = split_bodies(program, coordinates), np.zeros(len(of))
-        values = split_joints(program, coordinates)
+        bodies, square = closure.split_bodies(program, coordinates), np.zeros(len(of))
+        values = closure.split_joints(program, coordinates)
         limbs = zip(program.groups, equations.links, values, strict=True)
         for group, links, theta in limbs:
-            residual = Chain(group, links, bodies, theta, program.size).residual()
-            square += add_terms(add_terms(residual**2))
+            residual = closure.Chain(group, links, bodies, theta, program.size).residual()
+            square += closure.add_terms(closure.add_terms(residual**2))
         if self.task is not None:
             residual, _ = self.task(bodies[0].transpose(2, 0, 1), equations.rows)
             square += np.add.reduce(residual**2, axis=1)
@@ -435,7 +426,7 @@ class _Equations:
         one matrix with N right sides.
         """
         program, group, unknown = self.program, self.program.groups[i], self.unknown[i]
-        chain, u = Chain(group, self.links[i], bodies, theta, program.size), len(unknown)
+        chain, u = closure.Chain(group, self.links[i], bodies, theta, program.size), len(unknown)
         columns = chain.list_slopes(program)
         if self.sums is not None:
             columns += [self._list_drive(chain, column) for column in range(program.n_joints)]
@@ -470,7 +461,7 @@ class _Equations:
             ]
         return rows[:u], fronts, sign, pivot
 
-    def _list_drive(self, chain: Chain, column: int) -> FloatArray:
+    def _list_drive(self, chain: closure.Chain, column: int) -> FloatArray:
         """Return the rows of the driven joints of one column of q."""
         group, rows = chain.group, np.zeros((1, 1, 1))
         for j in group.driven_joints:
@@ -493,10 +484,10 @@ class _Equations:
     def lead_to(self, now: Iterate, goal: FloatArray) -> BoolArray:
         """Return which full steps (N,) lead close to the platform of a goal (3, 4, N)."""
         size, T = self.program.size, now.coordinates[:12].reshape(3, 4, -1)
-        rotation = matmul(exponential(now.step[:3]), T[:, :3]) - goal[:, :3]
+        rotation = closure.matmul(closure.exponential(now.step[:3]), T[:, :3]) - goal[:, :3]
         position = T[:, 3] + now.step[3:6] - goal[:, 3]
         turned = np.add.reduce(np.add.reduce(rotation**2, axis=0), axis=0)
-        square = 0.5 * size**2 * turned + dot(position, position)
+        square = 0.5 * size**2 * turned + closure.dot(position, position)
         length = np.minimum(NEAR * size, NEARER * now.length)
         return (now.length <= 0.5 * size) & (square <= length**2)
 
@@ -504,18 +495,20 @@ class _Equations:
         """Return the coordinates a fraction (N,) of its step beyond an iterate."""
         out, nodes = now.coordinates.copy(), len(self.program.nodes)
         twists = (fraction * now.step[: 6 * nodes]).reshape(nodes, 6, -1)
-        old, bodies = (split_bodies(self.program, a) for a in (now.coordinates, out))
+        old, bodies = (closure.split_bodies(self.program, a) for a in (now.coordinates, out))
         for twist, T, new in zip(twists, old, bodies, strict=True):
-            new[:, :3] = matmul(exponential(twist[:3]), T[:, :3])
+            new[:, :3] = closure.matmul(closure.exponential(twist[:3]), T[:, :3])
             new[:, 3] += twist[3:]
         first = 6 * nodes
-        for theta, unknown in zip(split_joints(self.program, out), self.unknown, strict=True):
+        for theta, unknown in zip(
+            closure.split_joints(self.program, out), self.unknown, strict=True
+        ):
             last = first + len(unknown) * theta.shape[1]
             if unknown:
                 theta[unknown] += fraction * now.step[first:last].reshape(-1, *theta.shape[1:])
             first = last
         driven = fraction * now.step[first:]
-        limbs = split_joints(self.program, out) if len(driven) else []
+        limbs = closure.split_joints(self.program, out) if len(driven) else []
         for group, theta in zip(self.program.groups, limbs, strict=False):
             for j in group.driven_joints:
                 theta[j] += driven[group.actuator[j]]
@@ -525,10 +518,10 @@ class _Equations:
 def _pack(program: Program, solved: Solved, shape: tuple[int, int]) -> State:
     """Return solved rows as a state with the axes (t, n)."""
     bodies = np.zeros((len(program.nodes), solved.coordinates.shape[1], 4, 4))
-    bodies[:, :, :3] = split_bodies(program, solved.coordinates).transpose(0, 3, 1, 2)
+    bodies[:, :, :3] = closure.split_bodies(program, solved.coordinates).transpose(0, 3, 1, 2)
     bodies[..., 3, 3] = 1.0
     T, *others = bodies.reshape(-1, *shape, 4, 4)
-    limbs = split_joints(program, solved.coordinates)
+    limbs = closure.split_joints(program, solved.coordinates)
     joints = tuple(a.transpose(2, 1, 0).reshape(*shape, *a.shape[1::-1]) for a in limbs)
     return State(
         T,

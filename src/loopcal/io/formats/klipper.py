@@ -34,13 +34,7 @@ from loopcal.errors import DataError, FileError
 from loopcal.findings import Quantity, report_finding
 from loopcal.io.core.csv_table import parse_finite
 from loopcal.io.core.yaml_file import format_yaml, parse_yaml
-from loopcal.io.formats.delta_gcode import (
-    NOMINAL_ANGLES,
-    DeltaGeometry,
-    format_robot,
-    get_geometry,
-    report_kinematics,
-)
+from loopcal.io.formats import delta_gcode
 from loopcal.io.formats.probe_reports import check_heights
 from loopcal.io.formats.program_format import (
     DECIMALS,
@@ -166,7 +160,9 @@ def read_config(path: Path, allowed: Sequence[str] = DELTAS) -> KlipperConfig:
     if kinematics in DELTAS:
         sentence = f"this printer's kinematics is {kinematics!r}, but the robot is {allowed[0]!r}"
         raise cfg.error(f"{sentence}. Name the file of the robot", "printer", "kinematics")
-    raise cfg.error(report_kinematics(kinematics, sections[:4]), "printer", "kinematics")
+    raise cfg.error(
+        delta_gcode.report_kinematics(kinematics, sections[:4]), "printer", "kinematics"
+    )
 
 
 def read(path: Path, options: ImportOptions) -> Imported:
@@ -187,7 +183,9 @@ def read(path: Path, options: ImportOptions) -> Imported:
     if is_rotary:
         text = format_rotary(cfg, options, path, bool(distances))
     else:
-        text = format_robot(parse_geometry(cfg), options, path, program, bool(distances))
+        text = delta_gcode.format_robot(
+            parse_geometry(cfg), options, path, program, bool(distances)
+        )
     if not positions:
         return Imported(text, None, (report_finding("files.no-probed-heights"),))
     steps = [get_step_distance(cfg, section, is_rotary) for section in STEPPERS]
@@ -221,12 +219,12 @@ def read(path: Path, options: ImportOptions) -> Imported:
     return Imported(text, measurements, (finding, *noted))
 
 
-def parse_geometry(cfg: KlipperConfig) -> DeltaGeometry:
+def parse_geometry(cfg: KlipperConfig) -> delta_gcode.DeltaGeometry:
     """Return the geometry with Klipper's defaults: arm and stop of tower a, angles 210, 330, 90."""
-    angles = zip(STEPPERS, NOMINAL_ANGLES, strict=True)
+    angles = zip(STEPPERS, delta_gcode.NOMINAL_ANGLES, strict=True)
     arm = cfg.number(STEPPERS[0], "arm_length")
     stop = cfg.number(STEPPERS[0], "position_endstop")
-    return DeltaGeometry(
+    return delta_gcode.DeltaGeometry(
         cfg.number("printer", "delta_radius"),
         tuple(cfg.number(s, "angle", nominal) for s, nominal in angles),
         tuple(cfg.number(s, "arm_length", arm) for s in STEPPERS),
@@ -386,13 +384,13 @@ def write(source: ExportSource, into: Path | None) -> Exported:
     if is_rotary:
         wanted = _list_rotary(source)
     else:
-        geometry = get_geometry(source, "klipper", DECIMALS)
+        geometry = delta_gcode.get_geometry(source, "klipper", DECIMALS)
         wanted = {("printer", "delta_radius"): geometry.radius}
         for k, section in enumerate(STEPPERS):
             wanted[section, "angle"] = geometry.angles[k]
             wanted[section, "arm_length"] = geometry.arms[k]
             wanted[section, "position_endstop"] = geometry.stops[k]
-    angles = ROTARY_ANGLES if is_rotary else NOMINAL_ANGLES
+    angles = ROTARY_ANGLES if is_rotary else delta_gcode.NOMINAL_ANGLES
     defaults = {(s, "angle"): angle for s, angle in zip(STEPPERS, angles, strict=True)}
     for section, option in wanted:  # left out, it is that of tower a
         if section in STEPPERS[1:] and option != "angle":

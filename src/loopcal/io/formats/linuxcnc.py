@@ -33,22 +33,8 @@ import numpy as np
 from loopcal.errors import DataError, FileError
 from loopcal.findings import Finding, report_finding
 from loopcal.io.core.yaml_file import format_yaml
+from loopcal.io.formats import program_format
 from loopcal.io.formats.delta_gcode import COMMENTS
-from loopcal.io.formats.program_format import (
-    DECIMALS,
-    Exported,
-    ExportSource,
-    Format,
-    Imported,
-    ImportOptions,
-    Name,
-    ValueFile,
-    format_head,
-    format_short,
-    get_record,
-    round_digits,
-    round_length,
-)
 from loopcal.mechanism.families.gough import Gough, Screw
 from loopcal.mechanism.families.linear_delta import LinearDelta
 from loopcal.mechanism.families.records import RobotRecord, values_per_leg
@@ -66,7 +52,7 @@ Values = Mapping[str, float]
 
 
 @dataclass(frozen=True)
-class HalFile(ValueFile):
+class HalFile(program_format.ValueFile):
     """A HAL file, whose values are pins."""
 
     what = "HAL file"
@@ -177,7 +163,7 @@ def _read_delta(hal: HalFile, home: float | None) -> dict[str, Any]:
         raise hal.error(f"{sentence}. Correct them", "", f"{DELTA}.L")
     content = {"radius": radius, "angles": list(TOWERS), "arms": rod, "readings": "height"}
     content |= {"stops": -math.sqrt(rod**2 - radius**2), "home": {"z": home or 0.0}}
-    half = round_length(0.5 * radius)
+    half = program_format.round_length(0.5 * radius)
     content["workspace"] = {"x": [-half, half], "y": [-half, half], "z": [0, half]}
     return content | {"stored_parameters": ["radius", "arm*.length", "tower*.stop"]}
 
@@ -213,7 +199,7 @@ COMPONENTS: Mapping[type[RobotRecord], Component] = {
 }
 
 
-def read(path: Path, options: ImportOptions) -> Imported:
+def read(path: Path, options: program_format.ImportOptions) -> program_format.Imported:
     """Read the pins.
 
     FileError : a pin is missing or not a number, or no unit of length is given.
@@ -223,32 +209,32 @@ def read(path: Path, options: ImportOptions) -> Imported:
         raise FileError.of("files.unit-missing", path)
     unit, kins = find_unit(options.length_unit, Dimension.LENGTH), COMPONENTS[family]
     stated = options.home_height
-    home = None if stated is None else round_digits(stated / unit.factor_to_si)
+    home = None if stated is None else program_format.round_digits(stated / unit.factor_to_si)
     content = kins.read(hal, home)
     findings: tuple[Finding, ...] = ()
     if home is None and (assumed := content["home"]["z"]):
         findings = (report_finding("files.home-assumed", height=f"{assumed:g} {unit}"),)
     if options.sigma_tape is not None:
-        sd = round_digits(options.sigma_tape / unit.factor_to_si)
+        sd = program_format.round_digits(options.sigma_tape / unit.factor_to_si)
         content["tolerances"] = {name: {"sd": sd} for name in kins.taped}
     what, units = f"{kins.name} settings of LinuxCNC", (unit.symbol, "deg")
     remark = f"Readings are positions of joints: {kins.joints}."
-    head = format_head(path, what, family.family, options.name, units, remark)
+    head = program_format.format_head(path, what, family.family, options.name, units, remark)
     comments = {name: COMMENTS[name] for name in ("tolerances", "workspace")}
     comments["stored_parameters"] = f"what {kins.name} stores"
-    return Imported(head + format_yaml(content, comments), None, findings)
+    return program_format.Imported(head + format_yaml(content, comments), None, findings)
 
 
-def write(source: ExportSource, into: Path | None) -> Exported:
+def write(source: program_format.ExportSource, into: Path | None) -> program_format.Exported:
     """Return the corrected pins in an existing HAL file, or `setp` lines of their own."""
     record, kins = _find_component(source, FORMAT.name)
     unit = find_unit(source.robot.units[Dimension.LENGTH])
     factor, (held, zeros) = unit.factor_to_si, kins.hold(source.values())
     hal = HalFile.parse((), Path("machine.hal")) if into is None else _read_hal(into, kins)[0]
-    wanted, findings = dict[Name, float | str](), list[Finding]()
+    wanted, findings = dict[program_format.Name, float | str](), list[Finding]()
     for pin, name in kins.pins.items():
         number = held[name] / factor - (hal.lift if pin.endswith(".z") else 0.0)
-        number = source.round_number(number, name, factor, DECIMALS)
+        number = source.round_number(number, name, factor, program_format.DECIMALS)
         wanted["", f"{kins.name}.{pin}"] = float(format_scaled(number, 1.0))
     if (screw := getattr(record, "screw", None)) is not None:
         of_screw = _list_screw_pins(screw, hal, source.robot.name, factor)
@@ -257,10 +243,13 @@ def write(source: ExportSource, into: Path | None) -> Exported:
         findings = [report_finding("files.machine-unit", unit=unit.symbol)]
     for n, (name, zero) in enumerate(zeros.items()):
         if abs(zero / factor) > ROUNDING:
-            shown = source.round_number(zero / factor, name, factor, DECIMALS)
-            code, length = "files.joint-position", f"{format_short(shown, DECIMALS)} {unit.symbol}"
+            shown = source.round_number(zero / factor, name, factor, program_format.DECIMALS)
+            code, length = (
+                "files.joint-position",
+                f"{program_format.format_short(shown, program_format.DECIMALS)} {unit.symbol}",
+            )
             findings.append(report_finding(code, joint=n, length=length, component=kins.name))
-    stored = {**ExportSource(source.robot.nominal).values(), **held}
+    stored = {**program_format.ExportSource(source.robot.nominal).values(), **held}
     others = ((n, v) for n, v in source.values().items() if n not in zeros)
     lost = [name for name, value in others if abs(value - stored[name]) > ROUNDING]
     if lost:
@@ -268,10 +257,12 @@ def write(source: ExportSource, into: Path | None) -> Exported:
     return hal.export(into, wanted, dict.fromkeys(wanted, 0.0), findings)
 
 
-def _find_component(source: ExportSource, format_name: str) -> tuple[RobotRecord, Component]:
+def _find_component(
+    source: program_format.ExportSource, format_name: str
+) -> tuple[RobotRecord, Component]:
     """Return the record of a robot and its component; DataError where no component is for it."""
     needed = "a hexapod (family gough) or a delta (family linear-delta)"
-    record = get_record(source, tuple(COMPONENTS), format_name, needed)
+    record = program_format.get_record(source, tuple(COMPONENTS), format_name, needed)
     return record, COMPONENTS[type(record)]
 
 
@@ -285,7 +276,7 @@ def _read_hal(path: Path, *wanted: Component) -> tuple[HalFile, type[RobotRecord
     raise FileError(f"this file has no {names}. Name the HAL file that sets the geometry", path)
 
 
-FORMAT = Format(
+FORMAT = program_format.Format(
     "linuxcnc",
     "genhexkins or lineardeltakins settings of LinuxCNC",
     (".hal",),
@@ -303,7 +294,7 @@ LINEAR_UNITS = {"mm": "mm", "metric": "mm", "in": "in", "inch": "in", "imperial"
 
 
 @dataclass(frozen=True)
-class IniFile(ValueFile):
+class IniFile(program_format.ValueFile):
     """An INI file, whose values are entries by section."""
 
     what = "INI file"
@@ -316,10 +307,10 @@ class IniFile(ValueFile):
     does_first_count = True
 
 
-def write_ini(source: ExportSource, into: Path | None) -> Exported:
+def write_ini(source: program_format.ExportSource, into: Path | None) -> program_format.Exported:
     """Return an INI file with corrected offsets, or entries; for people what to add to each."""
     _, kins = _find_component(source, INI_FORMAT.name)
-    before = ExportSource(source.robot.nominal)
+    before = program_format.ExportSource(source.robot.nominal)
     zeros, nominal = (kins.hold(of.values())[1] for of in (source, before))
     joints = {f"JOINT_{n}": name for n, name in enumerate(zeros)}
     unit = source.robot.units[Dimension.LENGTH]
@@ -335,10 +326,10 @@ def write_ini(source: ExportSource, into: Path | None) -> Exported:
 
     def scale(name: str, start: float, origin: float) -> float:
         number = start + (zeros[name] - origin) / factor
-        return source.round_number(number, name, factor, DECIMALS)
+        return source.round_number(number, name, factor, program_format.DECIMALS)
 
     if ini is not None:
-        wanted: dict[Name, float | str] = {
+        wanted: dict[program_format.Name, float | str] = {
             (joint, OFFSET): scale(name, ini.number(joint, OFFSET), nominal[name])
             for joint, name in joints.items()
         }
@@ -346,10 +337,10 @@ def write_ini(source: ExportSource, into: Path | None) -> Exported:
     if source.is_for_people:
         lines = []
         for joint, name in joints.items():
-            number = f"{scale(name, 0.0, nominal[name]) + 0.0:+.{DECIMALS}f}"
+            number = f"{scale(name, 0.0, nominal[name]) + 0.0:+.{program_format.DECIMALS}f}"
             shown = number.rstrip("0").rstrip(".")
             lines += [f"[{joint}]", f"# add {shown} {unit} to {OFFSET}"]
-        return Exported("\n".join(lines) + "\n")
+        return program_format.Exported("\n".join(lines) + "\n")
     if not all(abs(zero) > ROUNDING for zero in nominal.values()):
         raise DataError.of("files.ini-needed", robot=source.robot.name)
     wanted = {(joint, OFFSET): scale(name, 0.0, 0.0) for joint, name in joints.items()}
@@ -357,7 +348,7 @@ def write_ini(source: ExportSource, into: Path | None) -> Exported:
     return IniFile.parse((), Path("machine.ini")).export(None, wanted, {}, notes)
 
 
-INI_FORMAT = Format(
+INI_FORMAT = program_format.Format(
     "linuxcnc-ini",
     "HOME_OFFSET of a LinuxCNC hexapod or delta in its INI file",
     (".ini",),

@@ -20,16 +20,7 @@ from pathlib import Path
 
 from loopcal.errors import FileError
 from loopcal.findings import report_finding
-from loopcal.io.core import text_file
-from loopcal.io.core.csv_table import (
-    Table,
-    format_exact,
-    format_header,
-    format_row,
-    parse_exact,
-    parse_finite,
-    read_template,
-)
+from loopcal.io.core import csv_table, text_file
 from loopcal.io.data.columns import TIME
 from loopcal.io.exports.conversion import Row, format_rows, read_rows
 from loopcal.measure.measurements import Measurements
@@ -63,7 +54,7 @@ class Journal:
     """
 
     path: Path
-    sheet: Table
+    sheet: csv_table.Table
     columns: tuple[str, ...]
     descriptor: int
     count: int = 0
@@ -81,7 +72,7 @@ class Journal:
 
     def _append(self, event: str, number: int, pose: str, time: str, cells: Row) -> None:
         line = [event, str(number), pose, time, *(cells.get(name, "") for name in self.columns)]
-        write_line(self.descriptor, self.path, format_row(line))
+        write_line(self.descriptor, self.path, csv_table.format_row(line))
         self.enter(event, number, pose, time, cells)
 
     def enter(self, event: str, number: int, pose: str, time: str, cells: Row) -> None:
@@ -113,7 +104,7 @@ def write_line(descriptor: int, path: Path, line: str) -> None:
 
 
 @contextmanager
-def open_session(folder: Path, sheet: Table, columns: Sequence[str]) -> Iterator[Journal]:
+def open_session(folder: Path, sheet: csv_table.Table, columns: Sequence[str]) -> Iterator[Journal]:
     """Open the session in a folder for a sheet, or begin one; `columns` are measured.
 
     FileError : the folder cannot be written, is used by another command, has other content, or
@@ -130,7 +121,12 @@ def open_session(folder: Path, sheet: Table, columns: Sequence[str]) -> Iterator
             raise FileError.of("session.in-use", folder)
         header = {"event": None, "row": None, "pose": None, TIME: None}
         header |= {name: sheet.units[name] for name in columns}
-        lines = [REMARK, "# format: 1", f"# sheet: {digest}", format_row(format_header(header))]
+        lines = [
+            REMARK,
+            "# format: 1",
+            f"# sheet: {digest}",
+            csv_table.format_row(csv_table.format_header(header)),
+        ]
         begin, content = "".join(f"{line}\n" for line in lines).encode(), path.read_bytes()
         if begin.startswith(content):  # nothing yet, or a header that was not written to its end
             os.ftruncate(descriptor, 0)
@@ -151,7 +147,7 @@ def open_session(folder: Path, sheet: Table, columns: Sequence[str]) -> Iterator
 
 def _read_journal(journal: Journal) -> None:
     """Enter the lines of a file."""
-    table = read_template(journal.path)
+    table = csv_table.read_template(journal.path)
     known = set(journal.sheet.pose_names())
     for row, cells in enumerate(table.rows):
         event, number, pose, time, *values = cells
@@ -177,7 +173,9 @@ def name_visits(visits: Sequence[Visit], taken: Sequence[str]) -> list[str]:
     return names
 
 
-def _list_rows(sheet: Table, visits: Sequence[Visit]) -> tuple[list[Row], dict[str, str | None]]:
+def _list_rows(
+    sheet: csv_table.Table, visits: Sequence[Visit]
+) -> tuple[list[Row], dict[str, str | None]]:
     """Return the rows of visits with the columns of the sheet, and their header."""
     of_sheet = {
         cells["pose"]: cells
@@ -191,13 +189,13 @@ def _list_rows(sheet: Table, visits: Sequence[Visit]) -> tuple[list[Row], dict[s
     return rows, {**sheet.units, TIME: None}
 
 
-def read_visits(robot: Mechanism, sheet: Table, visits: Sequence[Visit]) -> Measurements:
+def read_visits(robot: Mechanism, sheet: csv_table.Table, visits: Sequence[Visit]) -> Measurements:
     """Return the measurements of visits, each a pose of its own; FileError for a wrong cell."""
     rows, header = _list_rows(sheet, visits)
     return read_rows(robot, sheet, rows, header)
 
 
-def write_measurements(folder: Path, sheet: Table, visits: Sequence[Visit]) -> None:
+def write_measurements(folder: Path, sheet: csv_table.Table, visits: Sequence[Visit]) -> None:
     """Write the used rows as the input of a calibration."""
     used = [visit for visit in visits if visit.is_used]
     if used:
@@ -209,7 +207,7 @@ def write_measurements(folder: Path, sheet: Table, visits: Sequence[Visit]) -> N
 def read_typed(word: str) -> str | None:
     """Return a typed number, also with a decimal comma; empty for `-`, None for what is none."""
     number = "" if word.strip() == "-" else word.strip().replace(",", ".", 1)
-    return number if not number or parse_finite(number) is not None else None
+    return number if not number or csv_table.parse_finite(number) is not None else None
 
 
 def split_values(text: str, count: int) -> tuple[str, list[str] | None]:
@@ -227,14 +225,14 @@ def split_values(text: str, count: int) -> tuple[str, list[str] | None]:
 
 
 def convert_cells(
-    row: Row, units: Mapping[str, str | None], sheet: Table, columns: Sequence[str]
+    row: Row, units: Mapping[str, str | None], sheet: csv_table.Table, columns: Sequence[str]
 ) -> Row:
     """Return the measured cells of a row of an export in the units of the sheet."""
     cells: Row = {}
     for name in columns:
         cell, unit, wanted = row.get(name, ""), units.get(name), sheet.units[name]
         if cell and unit and wanted and unit != wanted:
-            value = parse_exact(cell, find_unit(unit).factor_to_si)
-            cell = format_exact(value, find_unit(wanted).factor_to_si)
+            value = csv_table.parse_exact(cell, find_unit(unit).factor_to_si)
+            cell = csv_table.format_exact(value, find_unit(wanted).factor_to_si)
         cells[name] = cell
     return cells

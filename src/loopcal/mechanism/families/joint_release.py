@@ -18,6 +18,7 @@ import numpy as np
 
 from loopcal.errors import MechanismError
 from loopcal.findings import Finding, report_finding
+from loopcal.mechanism import over_constraint
 from loopcal.mechanism.compilation import build
 from loopcal.mechanism.families.limbs import (
     Axis,
@@ -34,11 +35,6 @@ from loopcal.mechanism.families.placement import frame_from_axis
 from loopcal.mechanism.kinematics import compute_limb_frames, compute_readings, forward_trials
 from loopcal.mechanism.limb_rows import move_joint
 from loopcal.mechanism.model import Mechanism
-from loopcal.mechanism.over_constraint import (
-    find_nearby_states,
-    find_self_stress,
-    is_over_constrained,
-)
 from loopcal.mechanism.states import Status, list_bodies
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension
@@ -78,7 +74,7 @@ def propose_added_joints(robot: Mechanism) -> Finding | None:
     or that none was found; None for other machines, and those that no `limbs` file describes.
     """
     record = getattr(robot.record, "record", robot.record)
-    is_exact = is_over_constrained(robot) and not robot.program.may_stay_open
+    is_exact = over_constraint.is_over_constrained(robot) and not robot.program.may_stay_open
     if not (isinstance(record, Limbs) and is_exact and len(robot.program.freedoms) == 6):
         return None
     proposals = []
@@ -96,7 +92,7 @@ def propose_added_joints(robot: Mechanism) -> Finding | None:
 
 def _list_candidates(robot: Mechanism, record: Limbs) -> Iterator[AddedJoint]:
     """Yield the joints that can be added, joint by joint, rotations before slides."""
-    stress = find_self_stress(robot)  # (r, limbs, 6)
+    stress = over_constraint.find_self_stress(robot)  # (r, limbs, 6)
     frames = compute_limb_frames(robot, robot.values[None], robot.home_state)
     pairs = zip(robot.program.groups, robot.home_state.joints, strict=True)
     values = {i: own[0, 0, k] for group, own in pairs for k, i in enumerate(group.limbs)}
@@ -187,7 +183,9 @@ def _is_verified(robot: Mechanism, record: Limbs, chosen: list[AddedJoint]) -> b
     assumed = DEFAULT_ERROR * np.where(is_length, freer.size, 1.0)
     sd = np.where(np.isnan(table.tolerance), assumed, table.tolerance)
     values = table.nominal + sd * rng.standard_normal((2, len(table)))
-    q = compute_readings(robot, robot.parameters.nominal[None], find_nearby_states(robot))
+    q = compute_readings(
+        robot, robot.parameters.nominal[None], over_constraint.find_nearby_states(robot)
+    )
     state = forward_trials(freer, values, q, follow=False)
     return bool((state.status == Status.CONVERGED.value).all())
 

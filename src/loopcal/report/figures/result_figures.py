@@ -21,13 +21,8 @@ from loopcal.apply.validation import Validation
 from loopcal.apply.volume_accuracy import VolumeAccuracy
 from loopcal.diagnose.fit_examination import ROUNDING
 from loopcal.findings.wording import FINE, count_decimals, name_count
+from loopcal.mechanism import platform_coordinates
 from loopcal.mechanism.model import Mechanism
-from loopcal.mechanism.platform_coordinates import (
-    POSITION,
-    get_dimension,
-    list_dimensions,
-    read_coordinates,
-)
 from loopcal.planning.path import locate_home
 from loopcal.planning.plane_line_planning import SurfacePlan
 from loopcal.planning.pose_planning import Plan, PlannedPoses
@@ -168,10 +163,10 @@ def draw_accuracy_map(accuracy: AccuracyMap) -> Figure:
     measured pose, a grey square a pose whose uncertainty the data do not bound.
     """
     names, n = accuracy.names, len(accuracy.coordinates)
-    measured = read_coordinates(accuracy.measured.T, names)
+    measured = platform_coordinates.read_coordinates(accuracy.measured.T, names)
     # two positions along the axes and the third as slices, or else angles
-    lengths = [i for i, name in enumerate(names) if name in POSITION]
-    angles = [i for i, name in enumerate(names) if name not in POSITION]
+    lengths = [i for i, name in enumerate(names) if name in platform_coordinates.POSITION]
+    angles = [i for i, name in enumerate(names) if name not in platform_coordinates.POSITION]
     order = [*lengths, *angles] if len(lengths) > 1 else [*angles, *lengths]
     slices = _cut(accuracy, measured, order[2] if len(order) > 2 else None)
     quantities = [
@@ -244,7 +239,7 @@ def _draw_row(
             if of_mark.any():
                 axes.plot(x[of_mark], y[of_mark], marker, label=label, **style)
         axes.plot(*crosses[of_measured].T, "x", color=DARK, ms=4.5, label="measured pose")
-        if set(names) <= set(POSITION):
+        if set(names) <= set(platform_coordinates.POSITION):
             axes.set_aspect("equal", adjustable="datalim")
         label_axes(axes, labels[0], labels[1] if axes is panels[0] else "", title)
     return points
@@ -266,7 +261,7 @@ def _draw_line(
 
 def _unit_of(name: str) -> Unit:
     """Return the unit in which a controlled coordinate is drawn."""
-    return DISPLAY_UNITS[get_dimension(name)]
+    return DISPLAY_UNITS[platform_coordinates.get_dimension(name)]
 
 
 # The largest error in a volume: a solid in the colors of the bound at each of its points.
@@ -287,7 +282,7 @@ def draw_volume(accuracy: VolumeAccuracy) -> Figure:
 
     robot = accuracy.robot
     names = [name for name in robot.controlled if name in (accuracy.spacing or accuracy.worst)]
-    names = ([name for name in names if name in POSITION] or names)[:3]
+    names = ([name for name in names if name in platform_coordinates.POSITION] or names)[:3]
     units, count = [_unit_of(name) for name in names], len(names)
     unit = choose_unit(robot.get_unit(Dimension.LENGTH), [accuracy.pointwise], FINE)
     points, values = _list_solid(accuracy, names)
@@ -730,7 +725,7 @@ def draw_plan(plan: Plan) -> Figure:
     pose, it is dashed.
     """
     names, poses, units = plan.robot.controlled, plan.poses, plan.robot.shown_units
-    of_name = [units[d] for d in list_dimensions(names)]
+    of_name = [units[d] for d in platform_coordinates.list_dimensions(names)]
     labels = [f"{name} [{unit.symbol}]" for name, unit in zip(names, of_name, strict=True)]
     scale = np.array([unit.factor_to_si for unit in of_name])
     stops = np.concatenate([locate_home(plan.robot)[None], poses.coordinates]) / scale
@@ -864,7 +859,10 @@ def draw_surface_plan(plan: SurfacePlan) -> Figure:
         (COLORS[i % len(COLORS)], MARKERS[i // len(COLORS) % len(MARKERS)])
         for i in range(len(places))
     ]
-    labels = [f"group {i}, line along {POSITION[axis]}" for i, axis in enumerate(plan.axis, 1)]
+    labels = [
+        f"group {i}, line along {platform_coordinates.POSITION[axis]}"
+        for i, axis in enumerate(plan.axis, 1)
+    ]
     labels = labels if len(labels) <= MOST_GROUPS else [""] * len(labels)
     figure, (panels,) = start_panels(12.6, 5.0, 1, len(VIEWS))
     for words, width in (("line: points 1 and 2", 2.2), ("plane: point 1 and others", THIN)):
@@ -880,7 +878,7 @@ def draw_surface_plan(plan: SurfacePlan) -> Figure:
         _number_surfaces(axes, places[:, 0, view])
         axes.set_aspect("equal", adjustable="datalim")
         axes.margins(0.12)
-        x, y = (POSITION[i] for i in view)
+        x, y = (platform_coordinates.POSITION[i] for i in view)
         label_axes(axes, f"{x} [{unit.symbol}]", f"{y} [{unit.symbol}]")
     add_legend(figure)
     groups, points = plan.poses.groups.shape

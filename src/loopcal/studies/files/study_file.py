@@ -19,6 +19,7 @@ from loopcal.io.data.measurement_file import load_poses
 from loopcal.io.file_schemas import SchemaMaker
 from loopcal.io.robot import robot_file
 from loopcal.mechanism.model import Mechanism
+from loopcal.studies import specification
 from loopcal.studies.simulation.machines import (
     check_effects,
     check_surfaces,
@@ -28,33 +29,21 @@ from loopcal.studies.simulation.machines import (
     resolve_patterns,
 )
 from loopcal.studies.simulation.published_steps import check_legs
-from loopcal.studies.specification import (
-    BLOCK,
-    FACTORS,
-    PER_LEG,
-    CellContent,
-    ErrorsLevel,
-    MethodLevel,
-    NoiseLevel,
-    PosesLevel,
-    Robot,
-    Study,
-    StudySettings,
-    check_question,
-)
 
 # Factor -> record of its levels, of those that are not robots.
 LEVELS: Mapping[str, type] = {
-    key: get_field_types(CellContent)[name] for key, name in FACTORS.items() if key != "robots"
+    key: get_field_types(specification.CellContent)[name]
+    for key, name in specification.FACTORS.items()
+    if key != "robots"
 }
-SETTINGS = tuple(item.name for item in fields(StudySettings))
+SETTINGS = tuple(item.name for item in fields(specification.StudySettings))
 QUICK = "quick"
 
 
 def build_study_schema() -> dict[str, Any]:
     """Return the JSON Schema of study files."""
     make = SchemaMaker(units=False)
-    whole = make.list_keys(StudySettings)
+    whole = make.list_keys(specification.StudySettings)
     levels: dict[str, Any] = {}
     for key, record in LEVELS.items():
         stated = [make.refer(record)]
@@ -63,7 +52,7 @@ def build_study_schema() -> dict[str, Any]:
         one = {"anyOf": stated}
         named = {"type": "object", "additionalProperties": one}
         levels[key] = {"anyOf": [named, {"type": ["array", "string", "number", "boolean"]}]}
-    levels |= {key: {} for key in FACTORS if key not in levels}
+    levels |= {key: {} for key in specification.FACTORS if key not in levels}
     replaced = {"type": "object", "additionalProperties": {}}
     whole["properties"] |= {"format": {"const": 1}, **levels, QUICK: replaced}
     return make.finish("loopcal study file", whole)
@@ -79,7 +68,7 @@ class StudyContent(NamedTuple):
     places: Mapping[str, yaml_file.Location]
 
 
-def load_study(path: str | Path, quick: bool = False) -> Study:
+def load_study(path: str | Path, quick: bool = False) -> specification.Study:
     """Read a study file.
 
     Parameters
@@ -95,10 +84,12 @@ def load_study(path: str | Path, quick: bool = False) -> Study:
     return parse_study(yaml_file.read_yaml(path, "study file"), quick)
 
 
-def parse_study(file: yaml_file.YamlFile, quick: bool = False) -> Study:
+def parse_study(file: yaml_file.YamlFile, quick: bool = False) -> specification.Study:
     """Return the study of the content of a study file; parameters and errors as `load_study`."""
     robot_file.check_format(file, 1)
-    yaml_file.refuse_unknown_keys(file, list(file.content), ["format", *SETTINGS, *FACTORS, QUICK])
+    yaml_file.refuse_unknown_keys(
+        file, list(file.content), ["format", *SETTINGS, *specification.FACTORS, QUICK]
+    )
     full = {key: value for key, value in file.content.items() if key not in ("format", QUICK)}
     whole = StudyContent(file, full, {key: (key,) for key in full})
     study, short = build_study(whole), build_study(_apply_quick_tier(whole))
@@ -109,7 +100,7 @@ def _apply_quick_tier(content: StudyContent) -> StudyContent:
     """Return the content of a study file with the replacements of its quick tier."""
     file, stated = content.file, content.file.content.get(QUICK)
     if stated is None:
-        block = content.values.get("block", BLOCK)
+        block = content.values.get("block", specification.BLOCK)
         return StudyContent(file, {**content.values, "replicates": block}, content.places)
     if not isinstance(stated, dict):
         raise file.error(
@@ -118,17 +109,17 @@ def _apply_quick_tier(content: StudyContent) -> StudyContent:
             (QUICK,),
         )
     allowed = [key for key in SETTINGS if key != "title"]
-    yaml_file.refuse_unknown_keys(file, list(stated), [*allowed, *FACTORS], (QUICK,))
+    yaml_file.refuse_unknown_keys(file, list(stated), [*allowed, *specification.FACTORS], (QUICK,))
     places = {key: (QUICK, key) for key in stated}
     return StudyContent(file, {**content.values, **stated}, {**content.places, **places})
 
 
-def build_study(content: StudyContent) -> Study:
+def build_study(content: StudyContent) -> specification.Study:
     """Return the study of the content of a file; raise as `load_study`."""
     file, values, places = content.file, content.values, content.places
     settings_values = {key: value for key, value in values.items() if key in SETTINGS}
     location = places["replicates"][:-1] if "replicates" in places else ()
-    settings = read_record(file, settings_values, StudySettings, None, location)
+    settings = read_record(file, settings_values, specification.StudySettings, None, location)
     robots = read_robots(content)
     factors: dict[str, Any] = {}
     for key in (key for key in LEVELS if key in values):
@@ -144,8 +135,8 @@ def build_study(content: StudyContent) -> Study:
             stated = value if isinstance(value, dict) else {plain: value}
             factors[key][name] = read_record(file, stated, record, None, place)
     factors["robots"] = {name: robot for name, (robot, _) in robots.items()}
-    order = tuple(FACTORS[key] for key in values if key in FACTORS)
-    study = Study(**vars(settings), **factors, order=order)
+    order = tuple(specification.FACTORS[key] for key in values if key in specification.FACTORS)
+    study = specification.Study(**vars(settings), **factors, order=order)
     machines = [robot for _, robot in robots.values()]
     study = replace(study, poses=_load_pose_files(study, machines, content))
     check_levels(study, machines, content)
@@ -153,8 +144,8 @@ def build_study(content: StudyContent) -> Study:
 
 
 def _load_pose_files(
-    study: Study, robots: Sequence[Mechanism], content: StudyContent
-) -> dict[str, PosesLevel]:
+    study: specification.Study, robots: Sequence[Mechanism], content: StudyContent
+) -> dict[str, specification.PosesLevel]:
     """Return the levels of poses, those of files with the poses of these files."""
     file, levels = content.file, dict(study.poses)
     for name, value, place in _list_items(content, "poses") if "poses" in content.values else ():
@@ -181,7 +172,7 @@ def _load_pose_files(
     return levels
 
 
-def read_robots(content: StudyContent) -> dict[str, tuple[Robot, Mechanism]]:
+def read_robots(content: StudyContent) -> dict[str, tuple[specification.Robot, Mechanism]]:
     """Return name -> robot of the key `robots`: shipped names, or files beside the study file."""
     file = content.file
     if "robots" not in content.values:
@@ -199,7 +190,7 @@ def read_robots(content: StudyContent) -> dict[str, tuple[Robot, Mechanism]]:
             raise
         except LoopcalError as error:
             raise file.error(f"cannot read the robot {name!r}: {error}", place) from None
-        robots[name] = (Robot(value, robot_file.get_source(robot).file.text), robot)
+        robots[name] = (specification.Robot(value, robot_file.get_source(robot).file.text), robot)
     return robots
 
 
@@ -232,14 +223,16 @@ def _name(file: yaml_file.YamlFile, value: Any, place: yaml_file.Location) -> st
     return Path(value).stem if isinstance(value, str) and "/" in value else str(value)
 
 
-def check_levels(study: Study, robots: Sequence[Mechanism], content: StudyContent) -> None:
+def check_levels(
+    study: specification.Study, robots: Sequence[Mechanism], content: StudyContent
+) -> None:
     """Refuse levels that no block could be computed with, at their lines."""
     for key, check in (
-        ("instruments", lambda level: make_instrument(level, NoiseLevel())),
+        ("instruments", lambda level: make_instrument(level, specification.NoiseLevel())),
         ("poses", lambda level: _check_surfaces(level, study, robots)),
         ("methods", lambda level: _check_method(level, study, robots)),
         ("errors", lambda level: _check_errors(level, robots)),
-        ("questions", lambda question: check_question(study, question)),
+        ("questions", lambda question: specification.check_question(study, question)),
     ):
         for i, (name, level) in enumerate(getattr(study, key).items()):
             place = content.places.get(key, ())
@@ -251,26 +244,30 @@ def check_levels(study: Study, robots: Sequence[Mechanism], content: StudyConten
                 raise content.file.error(f"{name!r} of {key!r}: {error}", (*place, *step)) from None
 
 
-def _check_surfaces(level: PosesLevel, study: Study, robots: Sequence[Mechanism]) -> None:
+def _check_surfaces(
+    level: specification.PosesLevel, study: specification.Study, robots: Sequence[Mechanism]
+) -> None:
     """Raise LoopcalError where points on surfaces do not fit robots, instruments or effects."""
     if level.is_on_surfaces:
         for robot in robots:
             make_groups(robot, level)
         for instrument in study.instruments.values():
-            check_surfaces(make_instrument(instrument, NoiseLevel()))
+            check_surfaces(make_instrument(instrument, specification.NoiseLevel()))
         for effects in study.effects.values():
             check_effects(effects)
         if study.scores.verdict:
             raise DataError("a study of points on planes and lines has no verdict. Remove it")
 
 
-def _check_method(level: MethodLevel, study: Study, robots: Sequence[Mechanism]) -> None:
+def _check_method(
+    level: specification.MethodLevel, study: specification.Study, robots: Sequence[Mechanism]
+) -> None:
     """Raise DataError where a method does not fit the robots, or one of published studies the poses
     or the scores, and EstimationError where a robot does not fit identification leg by leg.
     """
     make_fit_options(level)
     for robot in robots:
-        if level.method == PER_LEG:
+        if level.method == specification.PER_LEG:
             check_legs(robot)
         if isinstance(level.lam, Mapping):
             Ridge(level.lam).resolve(select_free_parameters(robot).names)
@@ -286,7 +283,7 @@ def _check_method(level: MethodLevel, study: Study, robots: Sequence[Mechanism])
         )
 
 
-def _check_errors(level: ErrorsLevel, robots: Sequence[Mechanism]) -> None:
+def _check_errors(level: specification.ErrorsLevel, robots: Sequence[Mechanism]) -> None:
     """Raise DataError where a robot has no parameter of a name, or one of another dimension, or has
     common errors, whose sizes have no lower bound.
     """

@@ -31,7 +31,7 @@ pytestmark = [
     ),
 ]
 
-MM, POSES = 1e-3, 10
+MM, POSES = 1e-3, 20
 UNITS = np.repeat([MM, np.pi / 180], 3)
 """Of x, y, z, a, b, c in LinuxCNC."""
 MODULES = Path("/usr/lib/linuxcnc/modules")
