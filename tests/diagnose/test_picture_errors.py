@@ -16,6 +16,7 @@ from loopcal.diagnose.error_causes import (
     find_swapped_pictures,
     measure_picture_errors,
 )
+from loopcal.diagnose.model_discrepancy import check_lack_of_fit
 from loopcal.estimate.fit_linearization import linearize_fit
 from loopcal.measure.instrument import Gaussian, Instrument, Sensor
 from loopcal.measure.kinds.image import Image
@@ -25,12 +26,14 @@ SIGMA = 0.1  # [px]
 
 
 @cache
-def measure():
-    """Return a hexapod with errors of its spreads, and 16 pictures of its board."""
+def measure(again: int = 0):
+    """Return a hexapod with errors of its spreads, and 16 pictures of its board, and those of the
+    first poses again.
+    """
     robot = load_robot("hexapod-42")
     half, middle = np.array([30, 30, 15, 10, 10, 10]), np.array([0, 0, 200, 0, 0, 0])
     poses = middle + np.random.default_rng(3).uniform(-half, half, (16, 6))
-    poses = poses * np.repeat([1e-3, np.pi / 180], 3)
+    poses = np.concatenate([poses, poses[:again]]) * np.repeat([1e-3, np.pi / 180], 3)
     kind = Image(
         T_camera=geometry.make_pose(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.7])),
         T_board=geometry.make_pose(np.diag([1.0, -1.0, -1.0]), np.array([-0.04, 0.03, 0.01])),
@@ -42,6 +45,17 @@ def measure():
     instrument = Instrument((Sensor(kind, Gaussian(np.full(2, SIGMA))),))
     trials = simulate_trials(robot, sample_truth(robot, 1, 4), poses, instrument, 5)
     return robot, trials.trial(0), trials.T[0]
+
+
+@pytest.mark.parametrize("again", [0, 2])
+def test_only_pictures_of_the_same_pose_are_repeats(again):
+    robot, data, _ = measure(again)
+    lack = check_lack_of_fit(identify(robot, data), data)
+    corners, degrees = data.observations[0].kind.rows_per_pose, lack.pure_degrees
+    assert degrees == 2 * corners * again
+    assert (lack.findings[0].code == "residuals.no-repeats") == (again == 0)
+    if again:  # what differs between repeats is the noise as stated
+        assert 0.7 < lack.sigma_scale < 1.3
 
 
 def change(edit) -> Any:

@@ -562,10 +562,12 @@ def check_lack_of_fit(fit: Identification, data: Measurements) -> LackOfFit:
 
 
 def _pure_error(fit: Identification, data: Measurements, member: IntArray) -> tuple[float, int]:
-    """Sum of squares between repeats, and its degrees of freedom; each kind has its own means."""
+    """Sum of squares between repeats of a kind (of a corner), and its degrees of freedom."""
     problem, groups = problem_of(fit.free_parameters, data), []
     for rows in problem.rows:
-        same = np.column_stack([member[rows.poses_by_link], rows.nuisance])
+        counts = [column.dimension is Dimension.COUNT for column in rows.kind.columns]
+        numbers = np.nan_to_num(rows.measured[0][:, counts], nan=-1.0)
+        same = np.column_stack([member[rows.poses_by_link], rows.nuisance, numbers])
         if rows.kind.is_of_base:  # rows of targets on the base repeat no pose
             same = np.arange(len(rows.poses))[:, None]
         groups.append(np.unique(same, axis=0, return_inverse=True)[1].ravel())
