@@ -154,7 +154,6 @@ In ten steps the longest ones turn a joint by 5 rad. Steps close to a stretched 
 SHORT_SHARE = 1e-8
 # Relative singular value below which a combination of drives does not move the platform.
 DEPENDENT = 1e-9
-WEAK = 1e10  # condition of S S' above which the step is not S'(S S')^-1 r, but by singular values
 PATH_STEPS = 8  # steps of the path from the start's pose to a target
 
 
@@ -403,16 +402,12 @@ class _Rows:
 
 def _invert_slopes(slope: FloatArray) -> FloatArray:
     """Return pseudo-inverses (R, u, c) of slopes (R, c, u), without dependent combinations."""
-    if slope.shape[1] > slope.shape[2]:
-        return np.asarray(np.linalg.pinv(slope, rcond=DEPENDENT), np.float64)
-    transposed = slope.swapaxes(1, 2)
-    square = slope @ transposed
-    unknown = invert_weights(square)
-    inverse = transposed @ unknown
-    growth = np.linalg.norm(square, axis=(1, 2)) * np.linalg.norm(unknown, axis=(1, 2))
-    if (weak := ~(growth < WEAK)).any():
-        inverse[weak] = np.linalg.pinv(slope[weak], rcond=DEPENDENT)
-    return inverse
+    if slope.shape[1] <= slope.shape[2]:
+        orthogonal, triangle = np.linalg.qr(slope.swapaxes(1, 2))
+        pivots = np.abs(np.einsum("...ii->...i", triangle))  # up to 2^c singular values
+        if (pivots.min(axis=1) > 2.0 ** slope.shape[1] * DEPENDENT * pivots.max(axis=1)).all():
+            return np.matmul(orthogonal, np.linalg.inv(triangle).swapaxes(1, 2))
+    return np.asarray(np.linalg.pinv(slope, rcond=DEPENDENT), np.float64)
 
 
 def _select_drives(stage: Stage, u: FloatArray) -> FloatArray:
