@@ -261,7 +261,8 @@ def _compute_margins(
     """
     loops, (slope, good), moving = _list_matrices(robot, state)
     chain, n = robot.stages, state.T.shape[1]
-    transports = dict(transport_to_end(robot, state, -1)) if chain else {0: np.eye(6)}
+    carried = transport_to_end(robot, state, -1) if chain else [(0, np.eye(6)[None])]
+    transports = {i: to_end[0] for i, to_end in carried}
     margin, direction = np.full(n, 1.0 if chain else np.inf), np.tile(np.eye(6)[0], (n, 1))
     for i, (A, is_known) in loops.items():
         block = robot.blocks[i].robot

@@ -46,6 +46,10 @@ def register_format(entry: Format) -> Format:
 
     Raises
     ------
-    DataError : its name is one of loopcal.
+    DataError : it is no format, or its name is one of loopcal.
     """
+    from loopcal.io.formats.program_format import Format
+    from loopcal.measure.array_checks import check_type
+
+    check_type(entry, Format, "entry", "such as Format('name', ..)")
     return FORMATS.register(entry)
