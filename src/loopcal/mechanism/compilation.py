@@ -442,6 +442,8 @@ def _find_home(robot: Mechanism) -> State:
         state = close_with_free_actuators(robot, values, target, robot.home_state, held=held)
     else:
         state = inverse_trials(robot, values, target)
+        if state.closure_sign[0, 0] == 0:  # rounding may lead away from a singular start
+            _refuse_singular_start(robot, target)
     if state.status[0, 0] != engine.CONVERGED:
         if robot.assembly.couplings and movable < len(robot.controlled):
             raise MechanismError(
@@ -492,8 +494,7 @@ def _refuse_singular_start(robot: Mechanism, target: FloatArray) -> None:
         for i, (name, start, value) in enumerate(zip(COORDINATES[:6], *poses, strict=True)):
             least = STRETCHED * (robot.size if i < 3 else 1.0)
             if name not in robot.controlled and abs(value - start) > least:
-                dimension = Dimension.LENGTH if i < 3 else Dimension.ANGLE
-                shown = robot.to_quantity(float(value), dimension)
+                shown = robot.to_quantity(float(value), (Dimension.LENGTH, Dimension.ANGLE)[i // 3])
                 found["home", name, 0.0] = f"`home:` {name}", shown
         if found:
             joints, values = zip(*found.values(), strict=True)
