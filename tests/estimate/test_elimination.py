@@ -23,6 +23,7 @@ from loopcal.numerics.decomposition import NUISANCE_TOLERANCE, NULL_COMPONENT
 from loopcal.numerics.elimination import (
     EliminationTree,
     NodeFactors,
+    UnknownRoot,
     build_tree,
     eliminate_tree,
     fill_rows,
@@ -355,3 +356,12 @@ def test_fit_of_planes_that_share_a_probe_converges():
     assert (
         fit.rank == 30
     )  # of 42, less the frames of the base and of the tool: the probe and the planes are free
+
+
+def test_unknowns_that_a_root_lacks_are_known_also_where_it_has_none():
+    """A fit without setup parameters is validated by measurements that have some."""
+    for root in (UnknownRoot.make_empty(0), UnknownRoot.of(np.array([[0]]), np.array([[2.0]]))):
+        taken = root.take(np.array([-1, *range(len(root.columns))]))
+        assert not taken.values[0].any()
+        assert (taken.columns[0] == -1).all()
+        np.testing.assert_array_equal(taken.values[1:], root.values)

@@ -323,8 +323,8 @@ class UnknownRoot(NamedTuple):
 
     def take(self, rows: IntArray) -> UnknownRoot:
         """Return the root of some unknowns (k,), of which -1 is known."""
-        columns = np.where(rows[:, None] < 0, -1, self.columns[rows])
-        return UnknownRoot(columns, np.where(columns < 0, 0.0, self.values[rows]), self.total)
+        columns = np.pad(self.columns, ((0, 1), (0, 0)), constant_values=-1)[rows]
+        return UnknownRoot(columns, np.pad(self.values, ((0, 1), (0, 0)))[rows], self.total)
 
     def fill(self, rows: IntArray) -> FloatArray:
         """Return some rows (k, c), with the columns that any of them has."""
