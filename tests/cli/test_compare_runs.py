@@ -160,7 +160,9 @@ def test_a_run_whose_prior_lists_no_rows_is_shown_without_a_test(runs) -> None:
     assert np.isnan(comparison.pairs[0].p_value)
 
 
-@pytest.mark.parametrize("change", ["missing key", "huge index", "list", "text", "number"])
+@pytest.mark.parametrize(
+    "change", ["missing key", "huge index", "target more", "list", "text", "number"]
+)
 def test_a_run_with_another_validation_is_refused_by_name(runs, tmp_path, change) -> None:
     damaged = tmp_path / "damaged"
     shutil.copytree(runs / "june", damaged)
@@ -169,6 +171,8 @@ def test_a_run_with_another_validation_is_refused_by_name(runs, tmp_path, change
         del result["validation"]["after"]["position"]["targets"]
     elif change == "huge index":
         result["validation"]["after"]["position"]["rows"] = [10**30]
+    elif change == "target more":
+        result["validation"]["after"]["position"]["targets"] += [""]
     else:
         result["validation"] = {"list": [1], "text": "x", "number": 1.5}[change]
     (damaged / "result.json").write_text(json.dumps(result), "utf-8")

@@ -410,6 +410,16 @@ def test_header_that_was_damaged_gives_a_sentence(folder, name, value) -> None:
         assert store.header
 
 
+def test_schema_that_is_no_text_gives_a_sentence(folder) -> None:
+    with open_store(folder) as store:
+        store.add_block("key", A, 1, make_scores(1, 20), 0.1)
+    raw = (folder / NAME).read_bytes()
+    (folder / NAME).write_bytes(raw.replace(b"CREATE TABLE", b"CREATE\xa0TABLE"))
+    (folder / f"{NAME}-wal").touch()  # as a driver that was killed leaves it
+    with expect_refusal("store.damaged", FileError), read_store(folder):
+        pass
+
+
 MOUNTS = {
     "linux": [
         *(("/", "ext4", "rw"), ("/proc", "proc", "rw"), ("/srv", "nfs4", "rw")),

@@ -689,8 +689,8 @@ def _restore_errors(
         if components is None:
             size = np.array(stored["errors"], dtype=float)
             components = np.column_stack([size, np.full((len(size), 2), np.nan)])
-        measured = tuple(stored["components"])
-        quantities[quantity] = restore(
-            row_errors.QuantityErrors, stored, components=components, measured=measured
-        )
+        own = {"components": components, "measured": tuple(stored["components"])}
+        quantities[quantity] = errors = restore(row_errors.QuantityErrors, stored, **own)
+        if not len(components) == len(errors.rows) == len(errors.targets):
+            raise ValueError("errors, rows and targets of different numbers")
     return row_errors.PoseErrors(quantities)

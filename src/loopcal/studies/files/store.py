@@ -435,7 +435,7 @@ def _is_disk_full(path: Path, mode: str) -> bool:
     try:
         with closing(_connect(path, mode)) as connection:
             connection.execute("SELECT count(*) FROM sqlite_schema").fetchone()
-    except sqlite3.Error as error:
+    except (sqlite3.Error, UnicodeError) as error:  # the latter of an overwritten schema
         return getattr(error, "sqlite_errorcode", 0) & 0xFF in FULL
     return False
 
