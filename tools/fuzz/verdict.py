@@ -141,7 +141,7 @@ def _names_something(case: Case, message: str) -> bool:
     if re.search(r"(?<![\w-])--?[a-z]|Missing argument '|extra argument", said):
         return True
     names = {part for name in case.files for part in (name, Path(name).name)}
-    words = {word.lstrip("-") or "." for word in case.words[1:]}  # "" is the folder
+    words = {w.lstrip("-") or (f"{w}: " if w else ".") for w in case.words[1:]}  # "" is the folder
     words |= {str(Path(word)) for word in words}  # as a path, "x/" is "x"
     return any(escape(name) in said for name in (names | words))
 
