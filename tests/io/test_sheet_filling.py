@@ -194,6 +194,15 @@ def test_missing_unknown_and_repeated_points_are_listed(robot, sheet, points, tm
     assert f"{points[6][1][0] + 0.012:.6f}" in rows[1]
 
 
+def test_a_sheet_with_a_pose_twice_is_refused(robot, sheet, points, tmp_path) -> None:
+    """Both would get the same points, which no calibration takes."""
+    export = write_spatial_analyzer(tmp_path / "points.txt", points)
+    with sheet.open("a") as file:
+        file.write(sheet.read_text().splitlines()[-1] + "\n")
+    with pytest.raises(DataError, match=r"sheet.csv.*equal position values.*Remove the copies"):
+        fill(robot, sheet, export)
+
+
 @pytest.mark.parametrize("end", [b"\r\n", b"\r\r\n"])
 def test_settings_stay_whole_whatever_ends_the_lines(end, robot, sheet, points, tmp_path) -> None:
     sheet.write_bytes(sheet.read_bytes().replace(b"\n", end))

@@ -762,6 +762,6 @@ def read_rows(
     of_rows = tuple(lines.get(pose, table.header_line) for pose in columns["pose"])
     filled = replace(table, units=header, columns=columns, lines=of_rows)
     others = read_tables(table.path)[1:]
-    data = join_tables((filled, *others), robot, allow_outside_stroke=True, allow_duplicates=True)
+    data = join_tables((filled, *others), robot, allow_outside_stroke=True)
     measured = tuple(rows.take(rows.is_measured) for rows in data.observations)
     return replace(data, observations=measured)
