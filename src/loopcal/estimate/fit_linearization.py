@@ -135,10 +135,8 @@ def fold_smooth_errors(linear: FitLinearization, errors: SmoothErrors) -> FloatA
     """Return the factor (p + m + 1, p + m + 1) of the rows of a fit by its parameters and the m
     coefficients of errors of the poses; poses and nuisance parameters stay those of `linear`.
     """
-    at, (whole, solution) = (
-        linear.linearization,
-        linear.problem.with_errors(errors, linear.solution),
-    )
+    at = linear.linearization
+    whole, solution = linear.problem.with_errors(errors, linear.solution)
     z = np.pad(at.deviation, ((0, 0), (0, errors.count)))
     start = replace(at.next_start, deviation=z, poses=None, is_near=False)
     factor = empty_factor(1, z.shape[1])

@@ -442,8 +442,8 @@ def _find_home(robot: Mechanism) -> State:
         state = close_with_free_actuators(robot, values, target, robot.home_state, held=held)
     else:
         state = inverse_trials(robot, values, target)
-        if state.closure_sign[0, 0] == 0:  # rounding may lead away from a singular start
-            _refuse_singular_start(robot, target)
+        if state.closure_sign[0, 0] == 0 and state.status[0, 0] == engine.CONVERGED:
+            _refuse_singular_start(robot, target)  # from which rounding led away
     if state.status[0, 0] != engine.CONVERGED:
         if robot.assembly.couplings and movable < len(robot.controlled):
             raise MechanismError(

@@ -84,10 +84,8 @@ def _find_basis(vectors: FloatArray) -> FloatArray:
 def _linearize(robot: Mechanism, state: State) -> list[_Rows]:
     """Return the equations at the poses of a state (1, n), at the nominal values."""
     program, nominal = robot.program, robot.parameters.nominal[None]
-    blocks, slopes = (
-        limb_rows.linearize_state(robot, state, nominal),
-        limb_rows.differentiate_displacements(robot, nominal),
-    )
+    blocks = limb_rows.linearize_state(robot, state, nominal)
+    slopes = limb_rows.differentiate_displacements(robot, nominal)
     both, M = limb_rows.stack_scaled_rows(robot, blocks)[0], len(program.unknown_twists)
     _, (E,), limb = limb_rows.stack_limb_rows(program, blocks, slopes)
     _, (absorbed,), _ = limb_rows.stack_limb_rows(program, blocks, slopes, passive=True)

@@ -244,11 +244,9 @@ def write(source: program_format.ExportSource, into: Path | None) -> program_for
     for n, (name, zero) in enumerate(zeros.items()):
         if abs(zero / factor) > ROUNDING:
             shown = source.round_number(zero / factor, name, factor, program_format.DECIMALS)
-            code, length = (
-                "files.joint-position",
-                f"{program_format.format_short(shown, program_format.DECIMALS)} {unit.symbol}",
-            )
-            findings.append(report_finding(code, joint=n, length=length, component=kins.name))
+            text = program_format.format_short(shown, program_format.DECIMALS)
+            facts = {"joint": n, "length": f"{text} {unit.symbol}", "component": kins.name}
+            findings.append(report_finding("files.joint-position", **facts))
     stored = {**program_format.ExportSource(source.robot.nominal).values(), **held}
     others = ((n, v) for n, v in source.values().items() if n not in zeros)
     lost = [name for name, value in others if abs(value - stored[name]) > ROUNDING]
